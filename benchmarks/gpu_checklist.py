@@ -4,10 +4,10 @@
 
 Steps: what the machine is; the tests marked gpu; the same under compute-sanitizer (memcheck, then
 racecheck), where it is installed; the renderers' tests and times; the time of both networks on
-every execution provider; how fast training pairs are rendered; the optimizer benchmark's GPU part;
-`companion eval` of a recorded sequence on the GPU and on the CPU. A step that fails or runs out of
-time is reported and the next one runs. The folder: `report.md`, and the JSON of each table for
-`benchmarks.site.keep`. The exit code is 1 if a step failed, 2 if there is no GPU.
+every execution provider; the optimizer benchmark's GPU part; `companion eval` of a recorded
+sequence on the GPU and on the CPU. A step that fails or runs out of time is reported and the next
+one runs. The folder: `report.md`, and the JSON of each table for `benchmarks.site.keep`. The exit
+code is 1 if a step failed, 2 if there is no GPU.
 """
 
 from __future__ import annotations
@@ -67,7 +67,6 @@ def steps(sequence: Path | None, cache: Path | None, out: Path) -> list[Checklis
     for title, module, limit_s in (
         ("rendering", "rendering --triangles 1", 90),
         ("networks", "features.network_speed", 120),
-        ("pairs", "pairs configs/train_s0.yaml --pairs 32 --no-photos", 150),
         ("optimizer", "optimizer.gpu", 150),
     ):
         words = (*f"benchmarks.{module}".split(), "--json", f"{out}/{title}.json")

@@ -90,7 +90,7 @@ class CameraModel(StrictModel):
 
 
 def of_stream_size(camera: Camera) -> Camera:
-    """A photo's camera, resampled if it has more pixels than a `CameraModel` may have."""
+    """A photo's camera, resampled to at most 8192 px a side, the limit of a `CameraModel`."""
     share = _MOST_PX / max(camera.width, camera.height)
     if share >= 1.0:
         return camera
@@ -120,10 +120,8 @@ class FeedConfig(StrictModel):
     settings: SourceSettings = SourceSettings()
 
     def is_calibrated(self, today: date) -> bool:
-        """Whether the camera model is from a recent calibration: focus, temperature and shocks
-        change a camera.
-
-        False if the computer's clock (`today`) is before it.
+        """Whether the last calibration is at most 90 days old: focus, temperature and shocks change
+        a camera. False if it was never calibrated, or if `today` (the computer's clock) is before.
         """
         if self.calibrated is None:
             return False
@@ -131,7 +129,7 @@ class FeedConfig(StrictModel):
 
     @property
     def is_video(self) -> bool:
-        """Whether the frames come in packets: not from a folder of images."""
+        """Whether the frames come in packets: False only if `source` is now an existing folder."""
         return "://" in self.source or not Path(self.source).is_dir()
 
     @model_validator(mode="after")
@@ -195,7 +193,7 @@ class TargetConfig(StrictModel):
     timeout_s: float = Field(300.0, exclude=True)
 
     def for_map(self, kind: MapKind) -> TargetConfig:
-        """The settings over a map of this kind, which may lack roofs on which targets stand."""
+        """A copy whose `map_sigma_m` allows for the roofs and crowns that such a map lacks."""
         sigma_m = max(self.map_sigma_m, kind.unknown_height_sigma_m)
         return self.model_copy(update={"map_sigma_m": sigma_m})
 
@@ -271,7 +269,9 @@ class CompanionConfig(StrictModel):
 
     @property
     def state_folder(self) -> Path | None:
-        """Folder of what a restart reads (injection, last position); None: nothing is stored."""
+        """Folder of what a restart reads (injection, last position): `state_dir`, or that in which
+        the record's folder lies. None if both are null: nothing is stored.
+        """
         if self.state_dir is not None or self.record is None:
             return self.state_dir
         return self.record.folder.parent
@@ -289,8 +289,8 @@ def load_config(path: Path) -> CompanionConfig:
 
 
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
-    """Check a configuration given as plain data; `where` names it in errors. `ConfigError` lists
-    all problems.
+    """Check a configuration given as plain data; `where` names it in errors and in the warnings
+    about old keys. Paths stay as given (`resolved`). `ConfigError` lists all problems.
     """
     try:
         config = validated(CompanionConfig, with_current_keys(CompanionConfig, data, where))
@@ -304,7 +304,9 @@ def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
 
 
 def resolved(config: CompanionConfig, folder: Path) -> CompanionConfig:
-    """A copy with paths relative to `folder`; ValueError for a path that names nothing."""
+    """A copy whose relative paths start at `folder`. Sets also where signed links store their time
+    stamps (in `state_dir`). ValueError for an empty path; whether a file exists is not checked.
+    """
     localizer = config.localizer
     if localizer.model is not None:
         model = _path(folder, localizer.model, "localizer.model")
@@ -320,12 +322,18 @@ def resolved(config: CompanionConfig, folder: Path) -> CompanionConfig:
     if "://" not in camera.source:  # a device, a file or a folder
         source = _path(folder, Path(camera.source), "camera.source")
         camera = camera.model_copy(update={"source": str(source)})
+    targets = config.targets
+    if targets.detector is not None:
+        network = _path(folder, targets.detector.model, "targets.detector.model")
+        detector = targets.detector.model_copy(update={"model": network})
+        targets = targets.model_copy(update={"detector": detector})
     state_dir = config.state_dir and _path(folder, config.state_dir, "state_dir")
     update = {
         "map": _path(folder, config.map, "map"),
         "camera": camera,
         "localizer": localizer,
         "bridge": _resolve_bridge(config.bridge, folder, state_dir),
+        "targets": targets,
         "state_dir": state_dir,
         "record": record,
         "console": _resolve_console(config.console, folder),

@@ -62,6 +62,7 @@ def vision_fix(
     """The vehicle's position and attitude from the camera's estimate; for accepted estimates.
 
     attitude, gimbal: at the exposure. Together they give the camera's orientation on the body.
+    reset_count: number of jumps so far (`JumpCounter.count`).
     Without them the vehicle's attitude is unknown. The camera's position is then reported as that
     of the vehicle, and the square of the lever arm's length is added to the variance of each axis.
     """
@@ -94,7 +95,7 @@ def _quaternion(rotation: Array) -> tuple[float, float, float, float]:
 
 
 def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
-    """Rotation (3, 3) of the camera on the body, from the autopilot's two attitudes."""
+    """Rotation (3, 3) body_from_camera, from both attitudes to NED at the same time."""
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     rotation: Array = matrix_from_quaternion(attitude.quaternion).T @ ned_from_camera
     return rotation
@@ -121,9 +122,9 @@ def vehicle_prior(
     sigma: tuple[float, float],
     time_ns: int,
 ) -> PosePrior | None:
-    """The camera's pose and velocity at `time_ns` from the autopilot's data; None if unknown.
-
-    attitude, gimbal: at that time. sigma: of position (m) and rotation (rad).
+    """The camera's pose and velocity at `time_ns` from the autopilot's data. The newest position is
+    carried on by the EKF's velocity. None without attitude, gimbal, or a position within 2 s.
+    attitude, gimbal: at that time. sigma: of position (m) and rotation (rad), each per axis.
     """
     age_ns = time_ns - state.position_time_ns
     if attitude is None or gimbal is None or abs(age_ns) > _MAX_POSITION_AGE_NS:
@@ -148,7 +149,9 @@ def vehicle_prior(
 
 
 def target_report(fix: TargetFix, camera: Camera, frame: LocalFrame, number: int) -> TargetReport:
-    """A located target as a report. camera: that of its frame."""
+    """A located target as a report. camera: that of its frame, for its pixel as a share of the
+    image. frame: of the map. number: the target's id in MAVLink.
+    """
     position = frame.position(fix.position_world)
     velocity_ned = velocity_sigma = None
     if fix.velocity is not None:
@@ -183,7 +186,7 @@ def target_report(fix: TargetFix, camera: Camera, frame: LocalFrame, number: int
 
 def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> CameraView:
     """The camera's position and direction, and the ground point in the image's centre; that is None
-    if its ray does not hit the map.
+    if its ray does not hit the map. frame: of the map. cast: intersects rays with the map.
     """
     pose, camera = estimate.world_from_camera, estimate.camera
     position = frame.position(pose.translation)

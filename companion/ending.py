@@ -12,9 +12,9 @@ _PATIENCE_S = 5.0
 
 
 def wait_for_end(thread: threading.Thread) -> bool:
-    """Wait for a daemon thread that was told to end; returns whether it has ended. A thread that
-    hangs, for example on a disk or device, is named in the log. The shutdown then continues, so
-    that record and link are closed.
+    """Wait up to 5 s for a started daemon thread that was told to end; returns whether it has. A
+    thread that hangs, for example on a disk or device, is named in the log. The shutdown then
+    continues, so that record and link are closed.
     """
     thread.join(_PATIENCE_S)
     if thread.is_alive():

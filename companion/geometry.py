@@ -63,7 +63,9 @@ class Mount:
         yaw_deg: float = 0.0,
         lever_arm_m: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Mount:
-        """From Euler angles in degrees and the lever arm (3,), as in a configuration."""
+        """From Euler angles in degrees, applied as Rz(yaw) Ry(pitch) Rx(roll), and the lever arm
+        (3,), as in a configuration.
+        """
         angles = np.radians([roll_deg, pitch_deg, yaw_deg])
         return cls(matrix_from_euler(*angles), np.asarray(lever_arm_m, dtype=np.float64))
 

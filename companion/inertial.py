@@ -48,7 +48,9 @@ class VehicleTelemetry(Protocol):
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time; None unless it uses GNSS."""
+        """The EKF's latitude, longitude (degrees) and altitude AMSL (m) at a time; None unless it
+        uses GNSS.
+        """
         ...
 
 
@@ -66,7 +68,9 @@ class InertialDisplacement:
 
 
 class InertialTrack:
-    """Integrates samples as they arrive; any thread. restarts: number of gaps."""
+    """Integrates samples as they arrive; `follow` and `at` on any thread. restarts: number of
+    times that the integral began again at zero, the first included.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -78,13 +82,15 @@ class InertialTrack:
         self._track: deque[InertialDisplacement] = deque(maxlen=_KEPT)
 
     def follow(self, vehicle: VehicleTelemetry) -> None:
-        """Integrate the vehicle's samples since the last call."""
+        """Integrate the vehicle's samples since the newest one integrated."""
         with self._lock:
             for sample in vehicle.inertial_since(self.newest_ns):
                 self.add(sample, vehicle.attitude_at)
 
     def add(self, sample: InertialSample, attitude_at: Callable[[int], Attitude | None]) -> None:
-        """Add a sample; it is ignored without the autopilot's attitude."""
+        """Integrate one sample; not thread-safe. It is ignored if it is not newer than the last or
+        the autopilot's attitude is unknown then. After 0.3 s without samples the integral restarts.
+        """
         reference = attitude_at(sample.time_ns)
         if reference is None or sample.time_ns <= self.newest_ns:
             return
@@ -101,7 +107,7 @@ class InertialTrack:
         self._integrate(sample.time_ns, np.array([north, east]), dt)
 
     def at(self, time_ns: int) -> InertialDisplacement | None:
-        """The integral at a time, linear between samples; None outside of them."""
+        """The integral at a time, linear between samples; None outside of the newest 1024."""
         with self._lock:
             return self._at(time_ns)
 

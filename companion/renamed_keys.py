@@ -43,7 +43,8 @@ REMOVED = {
 
 
 def with_current_keys(model: type[BaseModel], data: dict[str, Any], where: str) -> dict[str, Any]:
-    """The settings of `model` with today's names; `where` names the file in warnings.
+    """A copy of `model`'s settings with today's names, without removed keys and constants; `where`
+    names the file in the warning for each.
 
     If a key is given under its old and its new name, both are kept, and the model refuses the old
     one.

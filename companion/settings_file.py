@@ -25,7 +25,9 @@ class SettingsError(ValueError):
 
 
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
-    """The mapping in a YAML file, {} for an empty file; otherwise raises `error_type`."""
+    """The mapping in a YAML file, {} for an empty file; `error_type`, with the file's name, if it
+    cannot be read, is over 1 MiB, or holds something else.
+    """
     try:
         data = load_yaml(plain_text(path, _MAX_BYTES))
     except OSError as error:
@@ -53,13 +55,13 @@ def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
     return read
 
 
-def settings(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """The fields of a model that a file can set (all without `exclude`)."""
+def settable_fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of a model that a file can set (all without `exclude`), by name."""
     return {name: field for name, field in model.model_fields.items() if not field.exclude}
 
 
 def nested_models(annotation: object) -> list[type[BaseModel]]:
-    """The models in a field's annotation, such as that of an optional section."""
+    """The models in a field's annotation, such as that of an optional section; [] without."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in nested_models(part)]
@@ -90,7 +92,7 @@ def _meant(model: type[BaseModel], where: Sequence[str | int]) -> str:
         if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
             return ""
         model = kind
-    close = difflib.get_close_matches(str(where[-1]), settings(model), n=1)
+    close = difflib.get_close_matches(str(where[-1]), settable_fields(model), n=1)
     return f", did you mean {close[0]}?" if close else ""
 
 

@@ -35,7 +35,8 @@ def snapshot_name(exposure_time_ns: int) -> str:
 class TrajectoryFiles:
     """Writes ``poses.txt`` (our pose lines), ``trajectory.tum`` and ``covariances.csv``.
 
-    Raises OSError if the disk does not accept them.
+    folder: exists; files of these names are replaced. frame: of the poses, for the geodetic pose
+    lines. OSError if the disk does not accept them.
     """
 
     def __init__(self, folder: Path, frame: LocalFrame) -> None:
@@ -50,7 +51,9 @@ class TrajectoryFiles:
             self._stack = stack.pop_all()
 
     def append(self, pose: StampedPose) -> None:
-        """Append a pose. `PoseFileError` without a time, which TUM needs."""
+        """Append a pose. `PoseFileError`, and nothing is written, without a time, which TUM needs.
+        A pose without a covariance has no row in covariances.csv.
+        """
         # All three lines are made before the first is written: the files stay in one order.
         line, tum = (
             pose_line(pose_row(pose.name, pose.world_from_camera, self._frame)),
@@ -73,9 +76,7 @@ class TrajectoryFiles:
 
 
 def write_trajectory(folder: Path, poses: Iterable[StampedPose], frame: LocalFrame) -> None:
-    """Write the files of a complete trajectory (`TrajectoryFiles`) into an existing folder; files
-    of that name are replaced. frame: of the poses. `PoseFileError` for a pose without a time.
-    """
+    """Write the files of a complete trajectory, as `TrajectoryFiles`, and close them."""
     files = TrajectoryFiles(folder, frame)
     with contextlib.closing(files):
         for pose in poses:

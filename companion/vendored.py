@@ -7,14 +7,10 @@ from importlib import resources
 
 def vendored(name: str) -> str:
     """The text of a file of companion/console/static/vendor."""
-    return _file(name)
+    folder = resources.files("companion") / "console" / "static" / "vendor"
+    return (folder / name).read_text(encoding="utf-8")
 
 
 def licence_of(package: str) -> str:
     """The licence in the package's files."""
-    return _file(f"LICENSE.{package}.txt")
-
-
-def _file(name: str) -> str:
-    folder = resources.files("companion") / "console" / "static" / "vendor"
-    return (folder / name).read_text(encoding="utf-8")
+    return vendored(f"LICENSE.{package}.txt")

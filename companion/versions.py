@@ -44,7 +44,7 @@ def processor() -> str:
 
 
 def checkout() -> str:
-    """The running commit, with `+` if files differ from it; empty if installed."""
+    """The checkout's commit, with `+` if files differ from it; "" if installed or without git."""
     root = Path(__file__).resolve().parents[1]
     if not (root / ".git").exists():
         return ""

@@ -28,7 +28,9 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
 
 
 def make_folder(path: Path, option: str = "") -> Path:
-    """Create the folder if it is missing; `ReportError` if that fails."""
+    """Create the folder and its parents if missing, and return it; `ReportError` if that fails or
+    `path` is a file. option: as in `writing`.
+    """
     if path.is_file():
         raise ReportError(f"{option} {path}: is a file; give a folder".lstrip())
     with writing(path, option):
@@ -37,8 +39,8 @@ def make_folder(path: Path, option: str = "") -> Path:
 
 
 def result_file(path: Path, option: str, suffixes: tuple[str, ...], *inputs: Path | None) -> Path:
-    """Check that a result may be written to a file. `ReportError` if it has another suffix, is one
-    of the inputs, or lies in a tile cache.
+    """`path`, if a result may be written there; nothing is created. `ReportError` if it has none of
+    the suffixes, given as ".csv", is one of the inputs, or lies in a tile cache.
     """
     if path.suffix.lower() not in suffixes:
         raise ReportError(f"{option} {path}: give a file that ends in {' or '.join(suffixes)}")

@@ -2,7 +2,7 @@
 
 It estimates a camera's pose from its image and a geo-referenced 3D map: `open_localizer` opens a
 map that `build_cache` made, `Localizer.set_prior` sets an approximate pose, `Localizer.track`
-localizes one frame after the other. examples/ has programs; api.md lists every name.
+localizes one frame after the other. examples/ has programs; `__all__` has every public name.
 """
 
 import os

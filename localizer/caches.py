@@ -7,7 +7,9 @@ from pathlib import Path
 
 
 def cache_folder(kind: str) -> Path:
-    """Cache folder of one kind, below `PILOT_CACHE` or else the user's cache folder."""
+    """The cache folder with the name `kind`, in the folder that the environment variable
+    PILOT_CACHE names or else in the user's cache folder. It may not exist yet.
+    """
     base = os.environ.get("PILOT_CACHE")
     if base:
         return Path(base) / kind

@@ -22,10 +22,10 @@ class DeviceArray:
 
     @classmethod
     def of(cls, other: Any) -> DeviceArray:
-        """From any object with ``__cuda_array_interface__`` (CuPy, PyTorch, numba).
+        """From any object with ``__cuda_array_interface__`` (CuPy, PyTorch, numba), without a copy.
 
-        The array must be complete, because the registration's stream does not wait for other
-        streams. `DeviceArrayError` if it has strides.
+        Its values must have been computed (synchronize first), because the registration's stream
+        does not wait for other streams. `DeviceArrayError` if it has strides.
         """
         interface = other.__cuda_array_interface__
         if interface.get("strides") is not None:
@@ -36,21 +36,19 @@ class DeviceArray:
         )  # fmt: skip
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """The same memory under another shape of the same size. `DeviceArrayError` if the sizes
-        differ.
-        """
+        """The same memory under another shape. `DeviceArrayError` if its size differs."""
         if int(np.prod(shape)) != int(np.prod(self.shape)):
             raise DeviceArrayError(f"a device array of shape {self.shape} cannot be {shape}")
         return DeviceArray(self.address, shape, self.dtype, self.owner)
 
     def checked_address(self, dtype: DTypeLike) -> int:
-        """The address, after checks of type and alignment that the kernels rely on.
-        `DeviceArrayError` if one of them differs.
+        """The address for a kernel. `DeviceArrayError` if the array is not of `dtype` or not
+        aligned to 16 bytes.
         """
         if self.dtype != np.dtype(dtype):
             raise DeviceArrayError(
-                f"device features are {self.dtype}, the kernels were asked for {np.dtype(dtype)}: "
-                "export the network in that precision or choose the other"
+                f"device features are {self.dtype}, the kernels take {np.dtype(dtype)}: export the "
+                "network in that precision"
             )
         if self.address % 16:
             raise DeviceArrayError(f"device array at {self.address:#x} is not aligned to 16 bytes")

@@ -18,8 +18,8 @@ _COUNTS = 1 << 16
 
 
 def read_rgb(path: Path) -> Image:
-    """RGB image (H, W, 3) of a file, rotated by its EXIF data. `SequenceError` if it is no image,
-    or of 16-bit grey, whose range is unknown here.
+    """RGB image (H, W, 3) of a file, rotated by its EXIF data. `SequenceError` if it cannot be
+    read, is no image, or is 16-bit grey, whose range is unknown here.
     """
     try:
         rgb = decode_rgb(path.read_bytes())
@@ -36,7 +36,9 @@ def decode_rgb(
     data: bytes, *, turned: bool = True, grey_range: GreyRange | None = None
 ) -> Image | None:
     """RGB image (H, W, 3) of a file's content, grey ones with three equal channels; None if it is
-    no image. turned: rotate it by its EXIF data. `GreyRangeError` for 16-bit grey without a range.
+    no image, or of colours that have not 8 or 16 bits; cv2.error if `data` is empty. turned: rotate
+    it by its EXIF data. Colours of 16 bits lose the lower 8. grey_range, for 16-bit grey only, and
+    its errors: see `grey_levels`.
     """
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
     if not turned:
@@ -79,7 +81,9 @@ def _table(grey_range: GreyRange) -> Image:
 
 
 def write_rgb(path: Path, rgb: Image, jpeg_quality: int = 95) -> None:
-    """Write an RGB image (H, W, 3) as PNG or JPEG, by suffix."""
+    """Write an RGB image (H, W, 3) as PNG or JPEG, by suffix, into an existing folder.
+    jpeg_quality: 0 to 100, for the suffix .jpg only.
+    """
     options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if path.suffix == ".jpg" else []
     _, coded = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     path.write_bytes(coded.tobytes())

@@ -32,7 +32,7 @@ def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
 
 
 def plain_text(path: Path, most: int | None = MOST_BYTES) -> str:
-    """Text of a plain file; see `plain_bytes` and `as_text`."""
+    """Text of a plain file; limit and errors as `plain_bytes`, encodings as `as_text`."""
     return as_text(plain_bytes(path, most))
 
 
@@ -57,11 +57,17 @@ def decode_lenient(data: bytes) -> str:
         return data.decode("utf-8-sig", "replace")
 
 
-def visible(paths: Iterable[Path]) -> list[Path]:
-    """Sorted paths without hidden files and macOS's ``._NAME`` files (AppleDouble)."""
+def without_hidden(paths: Iterable[Path]) -> list[Path]:
+    """The paths, sorted, without those whose name begins with a dot: hidden files, and macOS's
+    ``._NAME`` files (AppleDouble).
+    """
     return sorted(p for p in paths if not p.name.startswith("."))
 
 
 def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """A folder's visible files with these suffixes (lower case, with the dot), sorted by name."""
-    return visible(p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+    """A folder's visible files with these suffixes, sorted by name; subfolders are not searched.
+    suffixes: lower case, with the dot; the files' own may be upper case.
+    """
+    return without_hidden(
+        p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()
+    )

@@ -80,8 +80,9 @@ def load_yaml(text: str) -> Any:
 def misread_booleans(
     given: Any, taken: Any, where: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], bool]]:
-    """Yield (key path, value) of booleans in `given` that the model `taken` converted to numbers,
-    as pydantic does with yes, on and true.
+    """Yield (key path, value) of booleans that became numbers, as pydantic converts yes, on and
+    true. given: the parsed YAML; taken: the pydantic model that was made of it; where: the key path
+    of both.
     """
     if isinstance(given, bool):
         if isinstance(taken, int | float) and not isinstance(taken, bool):

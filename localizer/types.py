@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from localizer.errors import GreyRangeError
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, so3_log
 
 Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -58,8 +58,8 @@ class RenderedView:
 @dataclass(frozen=True)
 class FeatureLevel:
     """One pyramid level. features: (h, w, C) float32, channels last, C-contiguous, unit length per
-    pixel; confidence: (h, w) float32 in (0, 1), the complement of the paper's uncertainty;
-    stride: image pixels per feature pixel.
+    pixel but on the detail level (stride 1); confidence: (h, w) float32 in (0, 1), the complement
+    of the paper's uncertainty; stride: image pixels per feature pixel.
     """
 
     features: Float32
@@ -121,9 +121,20 @@ class PosePrior:
         rotation_sigma_deg: float = 4.0,
         time_ns: int = 0,
     ) -> PosePrior:
-        """A prior of a pose: position_sigma_m on each axis, and rotation_sigma_deg about each."""
+        """An independent prior of unknown velocity: position_sigma_m on each world axis, and
+        rotation_sigma_deg about each.
+        """
         sigma = np.repeat([position_sigma_m, np.radians(rotation_sigma_deg)], 3)
         return cls(world_from_camera, np.diag(sigma**2), time_ns)
+
+    def mahalanobis_squared(self, pose: Pose, covariance: Array | float = 0.0) -> float:
+        """Squared Mahalanobis distance (6 degrees of freedom) of a pose from the prior. covariance:
+        (6, 6) of the pose, as the prior's; 0: it is exact.
+        """
+        known = self.world_from_camera
+        turn = so3_log(pose.rotation @ known.rotation.T)
+        difference = np.concatenate([pose.translation - known.translation, turn])
+        return float(difference @ np.linalg.solve(self.covariance + covariance, difference))
 
 
 class RegistrationStatus(Enum):

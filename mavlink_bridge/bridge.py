@@ -145,7 +145,7 @@ class Bridge:
         self._fc.set_map_id(map_id)
 
     def start(self) -> None:
-        """Open the links, which reconnect by themselves."""
+        """Open the links and restore a killed process's state; `BridgeStateError` if repeated."""
         if self._started:
             raise BridgeStateError("the bridge was already started; make a new one")
         self._started = True
@@ -168,13 +168,15 @@ class Bridge:
         self._fc.on_tick(self._fc_link, self._clock())
 
     def hand_over(self) -> None:
-        """A restart follows the coming stop, which is not clean: keep state for the restart."""
+        """Call before `stop` if another process takes over: the state for a restart is kept."""
         if self._shared.enable is not None:
             self._shared.enable.stop(clean_shutdown=False)
         self._fc.end(clean_shutdown=False)
 
     def stop(self) -> None:
-        """Close the links; the bridge cannot be started again. Harmless when called again."""
+        """Close links, sockets and the .tlog, and delete the state for a restart (see `hand_over`).
+        The bridge cannot be started again. Harmless when called again.
+        """
         if self._stopped:
             return
         self._stopped = True
@@ -198,25 +200,29 @@ class Bridge:
     # --- in -------------------------------------------------------------------------------------
 
     def submit(self, fix: VisionFix) -> None:
-        """Queue a fix, to be sent or compared by the link's thread; never blocks."""
+        """Queue a fix, to be sent or (shadow mode) only compared with GNSS by the link's thread.
+        Never blocks; if 64 fixes wait, the oldest is dropped.
+        """
         self._fc.sender.put(fix)
         self._fc_link.wake()
 
     def report(self, target: TargetReport) -> None:
-        """Report a target to the ground station; never blocks."""
+        """Report a target to the ground station, and as Cursor-on-Target if `cot_endpoint` is set.
+        A gimbal that looks at it follows. Blocks only to resolve the name in `cot_endpoint`.
+        """
         self._to_ground(target)
         self._shared.look.report(target)
         if self._cot is not None:
             self._cot.send(target)
 
     def forget(self, target_id: int) -> None:
-        """Stop reporting the target of this number; never blocks."""
+        """Stop reporting this target; a gimbal that looks at it stays. Never blocks."""
         self._to_ground(TargetEnd(target_id))
         self._shared.look.forget(target_id)
 
     def track(self, request: TrackRequest) -> None:
-        """Process a track request as if a ground station had sent it; the target gets the next
-        number.
+        """Pass a track request on to `on_track`, in this thread, as if a ground station had sent
+        it. A new target gets the next number in place of the request's.
         """
         if request.kind != "stop":
             request = replace(request, number=next(self._shared.target_numbers))
@@ -224,8 +230,9 @@ class Bridge:
             self._shared.on_track(request)
 
     def inhibit(self, of: AlertId) -> None:
-        """Prevent what the alert inhibits (`Inhibits`) from starting, until `clear`. The pilot's
-        command (mode ``rc``) and `injection.force` override it.
+        """Prevent what the alert inhibits (`Inhibits`) from starting, until `clear`. Injection that
+        runs goes on. The pilot's command (mode ``rc``) starts injection all the same, and
+        `injection.force` also the switch to vision.
         """
         self._fc.inhibit(of)
 
@@ -234,7 +241,9 @@ class Bridge:
         self._fc.clear(of)
 
     def report_view(self, view: CameraView) -> None:
-        """Report the camera's view to the ground station (CAMERA_FOV_STATUS); never blocks."""
+        """Report the camera's view to the ground station (CAMERA_FOV_STATUS), and the aircraft as
+        Cursor-on-Target if `cot_aircraft` is set. Blocks only as `report` does.
+        """
         if self._config.camera.announce:
             self._to_ground(view)
         if self._cot is not None:
@@ -247,19 +256,21 @@ class Bridge:
     def set_health(
         self, level: HealthLevel, alerts: Sequence[Alert] = (), *, tell: bool = True
     ) -> None:
-        """Set the localizer's health and the active alerts, most severe first; each is sent once.
-
-        tell: False if another component has sent them already.
+        """Set the localizer's health and all active alerts, most severe first; new ones are sent.
+        To be called every second, also without a change. tell: False if another component has sent
+        the new ones already.
         """
         self._status.set_health(level, alerts, tell=tell)
 
     def report_alert(self, alert: Alert) -> None:
-        """Report an alert to the operator: STATUSTEXT to the ground station, and the log."""
+        """Report an alert to the operator: STATUSTEXT to the ground station, the log and
+        `on_alert`. Ignored if it equals the last alert and follows within a second.
+        """
         self._status.report(alert)
 
     def send_named_values(self, figures: Mapping[str, float]) -> None:
         """Send NAMED_VALUE_FLOAT for each value, if the setting `named_values` is on; never blocks.
-        figures: value by name, at most 10 characters.
+        figures: value by name of 1 to 10 characters, else ValueError.
         """
         if self._config.named_values:
             uptime_ms = self._shared.uptime_ms(self._clock())
@@ -279,26 +290,28 @@ class Bridge:
         return self._tracker.snapshot(self._clock())
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if it is not buffered."""
+        """The vehicle's attitude at a CLOCK_MONOTONIC time of the last seconds, else None."""
         return self._tracker.attitude_at(time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time, by gimbal or body, and mounting; or None."""
+        """The camera's attitude to NED at a CLOCK_MONOTONIC time: of the gimbal (of the vehicle, if
+        the camera is fixed), turned by the configured mounting. None if unknown.
+        """
         return self._tracker.gimbal_at(time_ns)
 
     def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
-        """The camera's reported zoom at a time, per cent of its range; None: unknown. hold_s: how
-        long a report stays valid.
+        """The camera's reported zoom at a CLOCK_MONOTONIC time, per cent of its range; None:
+        unknown. hold_s: how long a report stays valid.
         """
         return self._tracker.zoom_at(time_ns, hold_s)
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's position (north, east, down) from its origin at a time, m; None: unknown."""
+        """The EKF's north, east, down from its origin, m, at a CLOCK_MONOTONIC time; or None."""
         return self._tracker.local_at(time_ns)
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's (latitude, longitude, altitude AMSL) at a time; None unless it uses healthy
-        GNSS.
+        """The EKF's (latitude, longitude in degrees, altitude AMSL in m) at a CLOCK_MONOTONIC time;
+        None unless the EKF uses GNSS now, and GNSS is healthy.
         """
         if not self.on_gnss or not gnss_healthy(self.state(), self._clock()):
             return None
@@ -306,29 +319,29 @@ class Bridge:
 
     @property
     def on_gnss(self) -> bool | None:
-        """Whether the EKF uses GNSS, healthy or not, by its source set. False if the receiver is
-        our GPS_INPUT; None if the set is unknown.
+        """Whether the EKF uses GNSS, healthy or not, by its source set; None if the set is unknown.
+        False also if our positions may be in it: they are its receiver, or fused beside GNSS.
         """
         return self._fc.on_gnss(self._clock())
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """IMU samples of the vehicle after a CLOCK_MONOTONIC time, oldest first."""
+        """The newest IMU samples (512 at most) after a CLOCK_MONOTONIC time, oldest first."""
         return self._tracker.inertial_since(time_ns)
 
     def mission(self) -> tuple[MissionWaypoint, ...]:
-        """Positions of the vehicle's mission, as far as they are known. The first call starts the
-        download; changes are followed.
+        """Positions of the vehicle's mission; () until they are known. The first call starts the
+        download, in the link's thread; a changed mission is downloaded again.
         """
         mission = self._fc.requests.mission
         mission.wanted = True
         return mission.waypoints
 
     def alerts(self) -> list[Alert]:
-        """The last alerts for the operator, oldest first."""
+        """The last 64 alerts that were reported, oldest first; also those that have ended."""
         return self._status.alerts()
 
     def last_ticks_ns(self) -> dict[str, int]:
-        """Time of the last run of each link's thread, CLOCK_MONOTONIC ns, by the link's name."""
+        """When the threads "link fc" and "link ground" (if any) last ran, CLOCK_MONOTONIC ns."""
         return {f"link {link.name}": link.last_tick_ns for link in self._links}
 
     @property
@@ -341,8 +354,8 @@ class Bridge:
 
     @property
     def injecting(self) -> bool:
-        """Whether fixes are being sent to the flight controller (mode, pilot's enable and shadow
-        check).
+        """Whether mode, pilot's enable and shadow check let fixes be sent; `reaches_ekf` tells
+        whether any are.
         """
         return self._fc.injecting
 
@@ -353,13 +366,13 @@ class Bridge:
 
     @property
     def injection_fault(self) -> Alert | None:
-        """Alert while injecting if positions are not sent, or the EKF does not follow them; None
-        otherwise. The operator was told.
+        """Alert, reported already, if `injecting`, and positions are not sent or the EKF does not
+        follow them; None otherwise.
         """
         return self._fc.injection_fault
 
     def shadow_score(self) -> ShadowScore:
-        """Comparison of vision with GNSS while GNSS was healthy."""
+        """Comparison of vision with GNSS over the last two minutes, where GNSS was healthy."""
         return self._fc.shadow_score(self._clock())
 
     def loop_verdict(self) -> LoopVerdict | None:
@@ -381,7 +394,7 @@ class Bridge:
         return result
 
     def queue_lengths(self) -> dict[str, int]:
-        """Number of queued messages or bytes, by queue."""
+        """Number of messages, samples or bytes that each queue holds, by its name."""
         result = {"alerts": len(self._status.alerts()), **self._fc.queue_lengths()}
         if self._ground is not self._fc.components:
             result.update({f"ground {name}": n for name, n in self._ground.queue_lengths().items()})

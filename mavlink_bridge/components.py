@@ -89,7 +89,7 @@ class Components:
         self._next_heartbeat_ns = 0
 
     def heartbeat(self, link: Link, now_ns: int) -> None:
-        """HEARTBEAT of each component at 1 Hz; its system status is the localizer's health."""
+        """Send each component's HEARTBEAT, with the localizer's health, at most once a second."""
         if now_ns < self._next_heartbeat_ns:
             return
         self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
@@ -108,7 +108,7 @@ class Components:
             link.send(message, component)
 
     def serve_camera(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Send targets and camera view to the ground station, if the link has room."""
+        """Send the targets and camera view that are due, unless the link is congested."""
         if link.congested:
             return
         while self._outbound:
@@ -126,7 +126,8 @@ class Components:
         self._camera.tick(now_ns, position, self._shared.uptime_ms(now_ns), link.send)
 
     def command(self, link: Link, message: Any, time_ns: int) -> None:
-        """Process a command of a ground station to one of our components.
+        """Execute and answer a command of a ground station to one of our components; others are
+        ignored. Commands that change something are denied to systems outside `ground_systems`.
 
         While the link is congested, the command is not answered, as if it were lost. The sender
         repeats it, and many commands cannot delay positions.

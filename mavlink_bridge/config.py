@@ -182,7 +182,7 @@ class CameraConfig(StrictModel):
 
     @property
     def vertical_fov_deg(self) -> float:
-        """Vertical field of view of square pixels, degrees."""
+        """Vertical field of view, degrees, from the horizontal one and the size; square pixels."""
         half = math.tan(math.radians(self.horizontal_fov_deg) / 2.0)
         return math.degrees(2.0 * math.atan(half * self.height_px / self.width_px))
 
@@ -228,7 +228,7 @@ class SigningConfig(StrictModel):
     state_file: Path | None = Field(None, exclude=True)
 
     def state_path(self, link: str) -> Path:
-        """File of the replay window of the link of this name."""
+        """File that keeps the newest signed timestamps of a link, "fc" or "ground"."""
         name = f"{self.key_file.name}.{link}.seen"
         return self.state_file or self.key_file.with_name(name)
 

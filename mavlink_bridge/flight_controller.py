@@ -65,7 +65,8 @@ def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
 
 
 class FlightControllerEnd:
-    """Handles the flight controller's link, in its thread; only `sender.put` is called from others.
+    """Handles the flight controller's link, in its thread. Other threads call only `sender.put`,
+    `inhibit`, `clear`, and what reads its state.
 
     Above 200 lines: it passes each message and each clock tick to one of a dozen components.
     """
@@ -102,12 +103,13 @@ class FlightControllerEnd:
         self._mode: Mode = "off"
 
     def shadow_score(self, now_ns: int) -> ShadowScore:
-        """Comparison of vision with GNSS over the last two minutes."""
+        """Comparison of vision with GNSS over the two minutes before now_ns."""
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
     def on_gnss(self, now_ns: int) -> bool | None:
-        """Whether the EKF uses GNSS; None if its source set is unknown. False if the receiver is
-        our GPS_INPUT, or if vision is fused beside it.
+        """Whether the EKF uses GNSS; None if its source set is unknown. With a message that is the
+        EKF's receiver or fused beside GNSS: False if the set is unknown, or a fix was sent in the
+        last 10 s.
         """
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
@@ -123,11 +125,11 @@ class FlightControllerEnd:
             self._no_go.about = map_id
 
     def recall(self) -> None:
-        """Restore the state of a process that was killed; called before the link starts."""
+        """Restore and report a killed process's failed shadow check; before the link starts."""
         self._interlock.recall()
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """End the memories: after the link has ended, or for a restart before it."""
+        """Delete the stored shadow failure (clean_shutdown) or keep it; the first call counts."""
         self._interlock.end(clean_shutdown=clean_shutdown)
 
     def inhibit(self, of: AlertId) -> None:
@@ -144,7 +146,7 @@ class FlightControllerEnd:
 
     @property
     def injecting(self) -> bool:
-        """Whether fixes are being sent: mode, pilot's enable and shadow check."""
+        """Whether mode, pilot's enable and shadow check let fixes be sent."""
         return self._mode == self._shared.mode() == "inject"
 
     @property
@@ -187,7 +189,7 @@ class FlightControllerEnd:
     # --- messages in ----------------------------------------------------------------------------
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """Process one message of the flight controller's link, also those that it routes."""
+        """Process a message of the vehicle, a command routed to us, or a heartbeat of others."""
         kind = message.get_type()
         if kind in COMMANDS_IN:
             self.components.command(link, message, time_ns)

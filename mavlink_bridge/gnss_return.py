@@ -78,8 +78,9 @@ class GnssReturnCheck:
         self.refusal, self.accepted, self._anchor = None, False, None
 
     def update(self, state: VehicleState, vision: PropagatedFix | None, now_ns: int) -> None:
-        """Process the newest report; called ten times a second. vision: None while it is not
-        reliable; the last result then stays.
+        """Process the receiver's newest report; called ten times a second. vision: the last
+        position, None while it is not reliable: nothing is accepted then, and the last refusal
+        stays.
         """
         velocity = np.array((state.local_velocity_ned or (0.0, 0.0))[:2])
         passed_s = min((now_ns - self._looked_ns) * 1e-9, 1.0)

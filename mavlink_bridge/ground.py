@@ -28,7 +28,7 @@ class GroundEnd:
         self.components.announce()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """Process commands to our components, and heartbeats of ground stations."""
+        """Process commands; a heartbeat of one of `ground_systems` selects the link's peer."""
         if message.get_type() == "HEARTBEAT":
             if message.get_srcSystem() in self._shared.config.ground_systems:
                 link.keep_peer()
@@ -37,7 +37,7 @@ class GroundEnd:
             self.components.command(link, message, time_ns)
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Send heartbeats and targets, once the vehicle's system id is known."""
+        """Send heartbeats and targets once the system id is known; returns the next time, ns."""
         config = self._shared.config
         state = self._shared.tracker.snapshot(now_ns)
         link.system_id = config.system_id or state.system_id or 0

@@ -83,7 +83,7 @@ def _is_covariance(P: Array) -> bool:
 
 
 def horizontal_sigma_m(P: Array) -> float:
-    """1 sigma in the worst horizontal direction of an NED covariance (m^2), m."""
+    """1 sigma in the worst horizontal direction, m, of an NED covariance P (3, 3), m^2."""
     return math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
 
 
@@ -107,8 +107,9 @@ class VisionFix:
     attitude_sigma_rad: float = 0.02
     """1 sigma of each angle."""
     reset_count: int = 0
-    """How often the localizer's own estimate has jumped so far. It never falls. Whoever takes fixes
-    in compares it with the one before: a fix that is dropped takes no jump with it."""
+    """Number of jumps of the localizer's estimate so far; it never decreases. A receiver compares
+    it with that of the last fix it has got, so a dropped fix loses no jump.
+    """
     quality: int = 100
     """0..100, for ODOMETRY."""
     velocity_ned: tuple[float, float, float] | None = None
@@ -116,11 +117,11 @@ class VisionFix:
     velocity_sigma_mps: float = 0.3
     """1 sigma along each axis of `velocity_ned`."""
     protection_m: tuple[float, float] | None = None
-    """What the horizontal and the vertical error exceed at the stated risk at most; None where
-    nobody says."""
+    """Horizontal and vertical protection level: bounds that the errors exceed with a probability of
+    1e-3 at most; None: not stated."""
     scale_sigma: float | None = None
-    """Of one that odometry carried on from an earlier fix: the share by which its velocity may be
-    wrong. The errors of two in a row are alike. None of any other."""
+    """Of a fix that visual odometry propagated from an earlier one: relative sigma of its velocity,
+    the same error in consecutive fixes. None: not by odometry."""
     position_withheld: bool = False
     """The position is too uncertain to be sent; its change since the fix before is not."""
 
@@ -280,7 +281,7 @@ class PlaceHint:
     latitude_deg: float
     longitude_deg: float
     radius_m: float
-    """About so far off it may be (1 sigma)."""
+    """1 sigma of the stated position, m."""
 
 
 @dataclass(frozen=True)

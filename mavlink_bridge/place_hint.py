@@ -25,10 +25,11 @@ _GLOBAL = (
 
 
 def place_hint(message: Any) -> PlaceHint | None:
-    """The hint of a COMMAND_INT or COMMAND_LONG; None if it has no valid position.
+    """The hint of a COMMAND_INT or COMMAND_LONG; None if it has no valid position or a local frame.
 
-    param3: accuracy, 1 sigma in metres, at least 10; param5, param6: latitude and longitude, as
-    1e-7 degrees in COMMAND_INT, as degrees (to about a metre) in COMMAND_LONG.
+    param3: accuracy, 1 sigma in metres, limited to 10 to 20,000; 100 if not positive. param5,
+    param6: latitude and longitude, as 1e-7 degrees in COMMAND_INT, as degrees (to about a metre) in
+    COMMAND_LONG.
     """
     if message.get_type() == "COMMAND_INT":
         if message.frame not in _GLOBAL:  # x and y of a local frame are metres

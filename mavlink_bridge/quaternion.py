@@ -14,7 +14,7 @@ def wrap_pi(angle: float) -> float:
 
 
 def normalise(q: tuple[float, ...] | list[float]) -> Quaternion:
-    """Scale to unit length; ValueError for a zero quaternion."""
+    """Scale to unit length; ValueError for a quaternion that is zero or not finite."""
     w, x, y, z = q
     n = math.sqrt(w * w + x * x + y * y + z * z)
     if not n > 1e-6 or not math.isfinite(n):
@@ -40,7 +40,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
-    """Rotate the vector by q."""
+    """Rotate the vector by the unit quaternion q: from body axes to NED, if q is body to NED."""
     _, x, y, z = multiply(multiply(q, (0.0, *v)), conjugate(q))
     return x, y, z
 
@@ -59,7 +59,7 @@ def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def to_euler(q: Quaternion) -> Vector:
-    """(roll, pitch, yaw); inverse of `from_euler` away from pitch +-90 deg."""
+    """(roll, pitch, yaw) in radians; inverse of `from_euler` away from pitch +-90 deg."""
     w, x, y, z = q
     return (
         math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
@@ -82,7 +82,7 @@ def slerp(a: Quaternion, b: Quaternion, t: float) -> Quaternion:
 
 
 def rotated(q: Quaternion, rates: Vector, seconds: float) -> Quaternion:
-    """Attitude after a rotation of q at constant body rates (rad/s)."""
+    """The attitude q (body to NED) after `seconds` at constant body rates (rad/s)."""
     rx, ry, rz = (rate * seconds for rate in rates)
     angle = math.sqrt(rx * rx + ry * ry + rz * rz)
     if angle < 1e-9:

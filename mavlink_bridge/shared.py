@@ -21,7 +21,9 @@ FURTHER_CLICKS = 1_000_001
 
 
 def clicked_numbers() -> Iterator[int]:
-    """Yield target numbers for clicks; they differ from those of detected targets."""
+    """Endless iterator over target numbers for clicks, ascending: `CLICKED`, then from
+    `FURTHER_CLICKS` on, so that they differ from those of detected targets.
+    """
     return chain(CLICKED, count(FURTHER_CLICKS))
 
 
@@ -50,11 +52,11 @@ class Shared:
     """Of clicked targets, over all links; none is given twice."""
 
     def uptime_ms(self, now_ns: int) -> int:
-        """Milliseconds since the bridge started, its time_boot_ms."""
+        """Milliseconds since the bridge was made, for time_boot_ms fields: 32 bits, wrapped."""
         return (now_ns - self.begun_ns) // 1_000_000 & 0xFFFFFFFF
 
     def mode(self) -> Mode:
         """Current mode: off, shadow or inject; mode rc is resolved by the pilot's enable."""
         if self.enable is None:
             return self.config.mode
-        return "inject" if self.enable.open else "shadow"
+        return "inject" if self.enable.enabled else "shadow"

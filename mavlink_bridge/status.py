@@ -55,8 +55,8 @@ class OperatorStatus:
     def set_health(
         self, level: HealthLevel, alerts: Sequence[Alert], *, tell: bool, now_ns: int | None = None
     ) -> None:
-        """Set the active alerts, most severe first; call it repeatedly. New ones are sent if
-        `tell`.
+        """Set the health and all active alerts, most severe first; call it repeatedly. New alerts
+        are reported (`report`) if `tell`, otherwise noted as reported.
 
         An alert that comes and goes is sent at most every 10 s. Its end is sent only after it has
         lasted, because an overload may begin and end every other second. now_ns: CLOCK_MONOTONIC.
@@ -110,7 +110,7 @@ class OperatorStatus:
 
 
 def status_text(alert: Alert) -> Any:
-    """STATUSTEXT (253) of an alert."""
+    """STATUSTEXT (253) of an alert, cut to 50 ASCII characters."""
     raw = text(alert).encode("ascii", "replace")[:TEXT_LENGTH]
     return mavlink.MAVLink_statustext_message(severity(alert), raw)
 

@@ -23,7 +23,7 @@ class Hysteresis:
         self._over_ns: int | None = None
 
     def is_over(self, now_ns: int, *, bad: bool) -> bool:
-        """Add whether the problem exists now. True if it has been absent for long enough."""
+        """Add whether the problem exists now. True if it was absent long enough, or always."""
         if bad:
             if self._over_ns is not None:
                 relapsed = now_ns - self._over_ns < _RELAPSE_NS + 2 * self._wait_ns
@@ -53,7 +53,7 @@ class StatusNotifier:
         self._since_relief: dict[str, set[AlertKey]] = {}
 
     def reported(self, topic: str) -> Alert | None:
-        """The last alert of a topic; None before the first."""
+        """The last problem or relief of a topic; None before the first, or if it ended without."""
         return self._reported.get(topic)
 
     def forget(self, topic: str) -> None:
@@ -62,7 +62,8 @@ class StatusNotifier:
 
     def notify(self, topic: str, problem: Alert | None, relief: Alert | None = None) -> None:
         """Report a problem when it begins or changes in more than numbers, and `relief` when it
-        ends. No relief is reported before the first problem.
+        ends; None: no problem, or nothing to report at its end. No relief is reported before the
+        first problem, except for topics in `known`. topic: any name; each has its own memory.
         """
         news, last = problem or relief, self.reported(topic)
         if (news and news.key) == (last and last.key):

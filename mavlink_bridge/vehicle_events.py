@@ -32,8 +32,8 @@ class VehicleEvents:
     def update(
         self, state: VehicleState, now_ns: int, *, injecting: bool, refused: bool = False
     ) -> None:
-        """Process the vehicle's state. injecting: positions are being sent. refused: GNSS
-        contradicts vision, so it does not count as back.
+        """Report the loss and return of GNSS, and arming without it. injecting: positions are being
+        sent. refused: GNSS contradicts vision, so it does not count as back.
         """
         healthy = gnss_healthy(state, now_ns)
         self._follow_gnss(healthy and not (refused and not self._gnss), now_ns, injecting=injecting)
@@ -46,9 +46,8 @@ class VehicleEvents:
         self._armed = state.armed
 
     def set_hold_reason(self, reason: Alert | None, now_ns: int) -> None:
-        """Set the interlock's reason for not sending available fixes; None without one.
-
-        The shadow check needs some seconds, so a reason that passes soon is not reported.
+        """Set the interlock's reason for not sending available fixes; None without one. A reason is
+        reported once it has lasted 10 s, because the shadow check needs some seconds.
         """
         if reason is None:
             self._held_ns = None

@@ -20,7 +20,7 @@ class Location:
     altitude_m: float
 
     def ned_of(self, other: Location) -> tuple[float, float, float]:
-        """`other` in NED metres about this location."""
+        """North, east, down (m) from this location to `other`."""
         north, east = north_east(self, other.latitude_deg, other.longitude_deg)
         return north, east, self.altitude_m - other.altitude_m
 

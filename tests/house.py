@@ -1,4 +1,4 @@
-"""The rules of the house, read from source text: sizes, one-way imports, nothing private reached.
+"""The rules of the house, read from source text: sizes, one-way imports, nothing private named.
 
 Python files are given as a mapping of paths (POSIX, from the repository's root) to their text.
 Only what a search of the text makes suspect is parsed, so that the whole tree takes a second.
@@ -13,26 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
 PACKAGES = ("localizer", "mavlink_bridge", "companion", "sitl", "benchmarks")
-MOST_MODULES, MOST_LINES, MOST_METHODS, MOST_PARAMETERS = 15, 200, 15, 7
-
-# Above that, each for its reason.
-_MANY_PARAMETERS = {
-    # One registration's inputs, as the paper and the reference name them; the CPU and the GPU take
-    # the same, so that they can be exchanged.
-    "localizer/registration/cuda/registration.py:register",
-    "localizer/registration/cuda/schedule.py:run",
-    "localizer/registration/cuda/schedule.py:_upload",
-    "localizer/registration/cuda/curvature.py:winner_curvature",
-    "localizer/odometry/keyframe.py:keyframe_anchors",
-    # The launch of a kernel: the fields of its argument block.
-    "localizer/registration/cuda/steps.py:refine_launch",
-    # What they are made of is opened elsewhere (`open_localizer`, the training's run).
-    "localizer/tracking/pipeline.py:__init__",
-    "localizer/training/data/live.py:__init__",
-    # A plan's place: where, how large, how turned.
-    "localizer/synth/plan/planner.py:place",
-    "localizer/synth/plan/houses.py:_plan_plot",
-}
+MOST_MODULES, MOST_LINES, MOST_METHODS = 15, 200, 15
 
 # Which packages each may import.
 _MAY_IMPORT = {
@@ -42,13 +23,12 @@ _MAY_IMPORT = {
     "sitl": {"localizer", "mavlink_bridge", "companion"},
     "benchmarks": {"localizer", "mavlink_bridge", "companion", "sitl"},
 }
-# Other people's names that begin with an underscore and have no public way to what they do.
-_OUTSIDE = {"os._exit", "self._offscreen._renderer"}
-_OUTSIDE_MODULES = {"numba.core.runtime"}
-
 _IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.M)
-_REACHES = re.compile(r"([\w\])]+)\._(?!_)\w|import[^\n]* _(?!_)\w|setattr\(.*\b_(?!_)[A-Za-z]")
-_SIGNATURE = re.compile(r"^ *(?:async )?def \w+\((.*?)\)(?: ->|:)", re.M | re.S)
+# numba has no public way to its runtime.
+_PRIVATE = re.compile(
+    r"^[ \t]*from (?!numba\.core\.runtime)\S+ import (?:\([^)]*|.*)\b(?<!as )_[a-z]\w*"
+    r"|set(?:attr|item)\([^)]*?[\"'.]_[a-z]\w*[\"']", re.M,
+)  # fmt: skip
 _WAITS = re.compile(r"thread\w*\.join\((?:None)?\)", re.IGNORECASE)
 _FLIES = ("companion/", "mavlink_bridge/", "localizer/tracking/", "localizer/map/cache/")
 _CLASS = re.compile(r"^class .*\n(?:(?:[ \t)].*)?\n)*", re.M)  # up to the next line at column 0
@@ -101,33 +81,6 @@ def _too_large(node: ast.ClassDef) -> str:
     if methods > MOST_METHODS and f"{MOST_METHODS} public methods" not in reason:
         return f"{node.name} has {methods} public methods, and its docstring says no reason"
     return ""
-
-
-def long_signatures(files: Mapping[str, str]) -> list[str]:
-    """Functions of packages with too many parameters, `self` not counted. Compiled kernels take
-    what they need one by one, and a command takes its options.
-    """
-    return [
-        f"{path}: {node.name} takes {count} parameters; give it an object"
-        for path, text in files.items()
-        if path.split("/")[0] in PACKAGES
-        and any(m.group(1).count(",") >= MOST_PARAMETERS for m in _SIGNATURE.finditer(text))
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and (count := _parameters(node)) > MOST_PARAMETERS
-        and not _is_kernel_or_command(node)
-        and f"{path}:{node.name}" not in _MANY_PARAMETERS
-    ]
-
-
-def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-    return len(names) - (names[:1] in (["self"], ["cls"]))
-
-
-def _is_kernel_or_command(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    marks = [ast.unparse(mark) for mark in node.decorator_list]
-    return node.name.endswith("_command") or any("njit" in m or ".command(" in m for m in marks)
 
 
 def wrong_imports(files: Mapping[str, str]) -> list[str]:
@@ -203,48 +156,8 @@ def endless_waits(files: Mapping[str, str]) -> list[str]:
     ]
 
 
-def private_reaches(files: Mapping[str, str]) -> list[str]:
-    """Where a file uses an underscored name that it does not define itself. A test may set a
-    module's constant (``_CLOSE_S``), so that a limit of time is reached sooner.
+def private_names(files: Mapping[str, str]) -> list[str]:
+    """Where a file imports or sets an underscored name of another; ruff (SLF) finds the other uses.
+    A test may set a module's constant (``_CLOSE_S``), so that a limit of time is reached sooner.
     """
-    return [
-        f"{path}:{line}: {what}"
-        for path, text in files.items()
-        if any(m.group(1) not in ("self", "cls") for m in _REACHES.finditer(text))
-        for line, what in _reaches(ast.parse(text))
-    ]
-
-
-def _reaches(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    own = _defined(tree)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and _is_private(node.attr) and node.attr not in own:
-            if (what := ast.unparse(node)) not in _OUTSIDE:
-                yield node.lineno, what
-        elif isinstance(node, ast.ImportFrom) and node.module not in _OUTSIDE_MODULES:
-            for name in node.names:
-                if _is_private(name.name):
-                    yield node.lineno, f"from {node.module} import {name.name}"
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("setattr", "setitem")):
-            for argument in node.args[:2]:
-                if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
-                    name_set = argument.value.rpartition(".")[2]
-                    if _is_private(name_set) and not name_set.isupper():
-                        yield node.lineno, ast.unparse(node)
-
-
-def _defined(tree: ast.Module) -> set[str]:
-    names = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            names.add(node.name)
-        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            if node.value.id in ("self", "cls"):
-                names.add(node.attr)
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            names.add(node.id)
-    return names
-
-
-def _is_private(name: str) -> bool:
-    return name.startswith("_") and not name.startswith("__")
+    return [f"{p}: {m.group()}" for p, text in files.items() for m in _PRIVATE.finditer(text)]

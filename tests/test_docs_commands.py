@@ -12,14 +12,8 @@ from typer.main import get_command
 
 from sitl.__main__ import app
 from tests.benchmarks.commands import COMMANDS, source
+from tests.pages import PAGES, ROOT
 
-ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    [
-        *ROOT.glob("docs/**/*.md"),
-        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
-    ]
-)
 _CODE = re.compile(r"```[^\n]*\n(.*?)```|`([^`]+)`", re.S)
 _OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 _NAMED = re.compile(
@@ -32,7 +26,7 @@ _QUOTED = re.compile(r'(?<!ARGS=)"[^"]*"')  # another program, or a value
 
 def _companion() -> dict[str, set[str]]:
     """Options by command, of the page that is made from the program."""
-    page = (ROOT / "docs/reference/cli.md").read_text(encoding="utf-8")
+    page = PAGES[ROOT / "docs/reference/cli.md"]
     parts = re.split(r"\n## ", page)[1:]
     return {part.splitlines()[0]: set(_OPTION.findall(part)) for part in parts}
 
@@ -91,5 +85,5 @@ def strangers(line: str) -> list[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_and_their_options_exist(page: Path) -> None:
-    found = {line.strip(): strangers(line) for line in lines(page.read_text(encoding="utf-8"))}
+    found = {line.strip(): strangers(line) for line in lines(PAGES[page])}
     assert not {line: names for line, names in found.items() if names}

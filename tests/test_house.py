@@ -11,9 +11,8 @@ from tests.house import (
     endless_waits,
     folder_circles,
     large_classes,
-    long_signatures,
     module_circles,
-    private_reaches,
+    private_names,
     sources,
     wrong_imports,
 )
@@ -21,11 +20,10 @@ from tests.house import (
 RULES = (
     crowded_folders,
     large_classes,
-    long_signatures,
     wrong_imports,
     folder_circles,
     module_circles,
-    private_reaches,
+    private_names,
     endless_waits,
 )
 

@@ -1,6 +1,6 @@
 """Convergence of the registration: the paper's Table 4 (ablation), Table 6 and Fig. 10 (basin).
 
-    python -m benchmarks.basin ablation FOLDER [--set generated|plain|quito|portugal|caliterra]
+    python -m benchmarks.basin ablation FOLDER [--set generated|quito|portugal|caliterra]
     python -m benchmarks.basin priors FOLDER [--set ...] [--anchors N]
     python -m benchmarks.basin covariance FOLDER [--set ...]
     python -m benchmarks.basin axes FOLDER [--set ...] [--plot basin.png]
@@ -22,12 +22,12 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.basin import axes as basin_axes
-    from benchmarks.basin.run import BasinOutcome, groups, run, sized_starts, summary
+    from benchmarks.basin.run import BasinOutcome, run, sized_starts
     from benchmarks.basin.tables import Cells, ablation_table, covariance_table
     from benchmarks.basin.variants import (
         DEFAULT_ANCHORS,
@@ -67,40 +67,19 @@ def ablation(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """Table 4, or the priors: one line a variant and start."""
     rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
     outcomes = _registered(args, rows)
-    views = len({o.view for o in outcomes})
-    print(f"{args.set}: {views} views; R@1 = share within 1 m and 1 degree")
-    last = ""
-    for variant, start, mine, full in sorted(
-        groups(outcomes), key=lambda g: [v.name for v in rows].index(g[0])
-    ):
-        s = summary(mine, full)
-        nees = "    -" if s["nees"] is None else f"{s['nees']:5.1f}"
-        label, last = ("" if variant == last else variant), variant
-        print(
-            f"{label:34s} {start:9s} n={s['n']:<4.0f} R@1 {s['r1']:5.1f} "
-            f"[{s['r1_low']:4.1f}, {s['r1_high']:5.1f}]  change {s['change']:+5.1f} "
-            f"[{s['change_low']:+5.1f}, {s['change_high']:+5.1f}]  R@3 {s['r3']:5.1f}  "
-            f"median {s['median']:5.2f} m [{s['median_low']:.2f}, {s['median_high']:.2f}]  "
-            f"NEES {nees}  {s['ms']:5.1f} ms"
-        )
     return outcomes, ablation_table(args.set, outcomes)
 
 
 def covariance(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """NEES of "ours", those on which it was fitted apart."""
     outcomes = _registered(args, [Variant(FULL)])
-    columns, rows = covariance_table(args.set, outcomes, photos_of(args))
-    for row in (columns, *rows):
-        print(" | ".join(row))
-    return outcomes, (columns, rows)
+    return outcomes, covariance_table(args.set, outcomes, photos_of(args))
 
 
 def axes(args: argparse.Namespace) -> tuple[list[BasinOutcome], Cells]:
     """Table 6 and Fig. 10: share converged against the initial error of each axis."""
     variants = basin_axes.axis_variants()
     outcomes = run(views_of(args), variants, basin_axes.axis_starts, args.model, args.processes)
-    print(args.set, end=": ")
-    basin_axes.report(outcomes)
     if args.plot:
         basin_axes.plot(outcomes, args.plot)
     return outcomes, basin_axes.table(outcomes)
@@ -115,9 +94,7 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("what", choices=tuple(_TABLES), help="table")
     parser.add_argument("folder", type=Path, help="of worlds, maps and query images")
-    parser.add_argument(
-        "--set", default="generated", help="generated, plain, or a folder of --data"
-    )
+    parser.add_argument("--set", default="generated", help="generated, or a folder of --data")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="of real sets")
     parser.add_argument("--pairs", type=whole(1, 100_000), default=320, help="views")
     parser.add_argument("--processes", type=whole(1, 256), default=2, help="that register")
@@ -130,12 +107,11 @@ def main() -> None:
     parser.add_argument("--plot", type=output, help="PNG of the axes' curves")
     parser.add_argument("--json", type=output, help="the table and every outcome")
     args = parser.parse_args()
-    if args.set not in ("generated", "plain") and not (args.data / args.set).is_dir():
+    if args.set != "generated" and not (args.data / args.set).is_dir():
         parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
     outcomes, (columns, rows) = _TABLES[args.what](args)
-    if args.json:
-        made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}
-        write_figures(args.json, columns, rows, made)
+    made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}
+    show_figures(args.json, columns, rows, made)
 
 
 if __name__ == "__main__":

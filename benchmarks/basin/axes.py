@@ -16,7 +16,6 @@ from localizer.registration import JNGOConfig
 AXES = ("yaw", "pitch", "roll", "x", "y", "z")  # camera axes; yaw about y, pitch about x
 STEPS = (1.0, 2.0, 4.0, 6.0, 8.0, 11.0, 15.0)  # degrees or metres
 PAPER = {"yaw": 3.5, "pitch": 2.7, "roll": 3.2, "x": 5.6, "y": 8.1, "z": 7.4}  # Table 6
-MOTION = {"yaw": 6.7, "pitch": 3.0, "roll": 10.1, "x": 0.7, "y": 0.7, "z": 0.3}  # likewise
 _RESAMPLES = 400
 _JOINT = STEPS[-3:]
 
@@ -60,28 +59,6 @@ def axis_variants() -> list[Variant]:
         Variant("one, coarse to fine", one),
         Variant(FULL),
     ]
-
-
-def report(outcomes: list[BasinOutcome]) -> None:
-    """Prints the share converged of each axis and size, and the limits beside Table 6."""
-    cells = {(v, s): mine for v, s, mine, _ in groups(outcomes)}
-    names = list(dict.fromkeys(o.variant for o in outcomes))
-    counts = [len(c) for c in cells.values()]
-    print(
-        f"{len({o.view for o in outcomes})} views, {min(counts)} to {max(counts)} registrations a "
-        "cell; per cent within 1 m and 1 degree, by initial error"
-    )
-    for axis in ("all", *AXES):
-        print(f"\n{axis} ({_unit(axis)})".ljust(36) + "".join(f"{s:7.0f}" for s in STEPS))
-        for name in names:
-            print(f"{name:35s}" + "".join(f"{x:7.0f}" for x in shares(cells, name, axis)))
-    print("\nlimit: the error from which half as many converge as from the least [95 % interval]")
-    print(f"{'':35s}" + "".join(f"{a + ' (' + _unit(a) + ')':>19s}" for a in AXES))
-    for title, row in (("paper, Table 6", PAPER), ("paper, motion at 30 frames/s", MOTION)):
-        print(f"{title:35s}" + "".join(f"{row[a]:19.1f}" for a in AXES))
-    for name in names:
-        texts = [limit_text(limits(cells, name, a)) for a in AXES]
-        print(f"{name:35s}" + "".join(f"{t:>19s}" for t in texts))
 
 
 def table(outcomes: list[BasinOutcome]) -> Cells:

@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.basin.run import BasinOutcome, groups, summary
 from benchmarks.basin.variants import FULL
 from benchmarks.basin.views import VIEWS_PER_WORLD
-from benchmarks.features.report import wilson
+from benchmarks.common.shares import wilson
 
 BOUND = 12.59  # 95 % of the chi-square of 6 degrees of freedom
 COVARIANCE_COLUMNS = ("", "n", "mean NEES, its 95 % interval", "median", "within the bound, %")

@@ -17,14 +17,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.common.maps import build_map, layers_of, origin_of
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.importers.rules import ImportRules
 from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
@@ -39,8 +38,6 @@ SIZE = (320, 240)
 WORLD_SEED = 2_000_000  # training and the feature benchmark stay below
 VIEWS_PER_WORLD = 40
 WORLD_M = 800.0
-_PLAIN_FROM = 8  # candidates for each view of the set "plain"
-_DULL = ("fog", "dusk", "night")
 _LEAST_MAP = 0.9  # share of the true view that shows the map
 
 
@@ -59,12 +56,9 @@ class BasinView:
 def load_views(name: str, folder: Path, data: Path, count: int) -> list[BasinView]:
     """At least `count` views of a set, where it has so many, made on the first call.
 
-    name: "generated"; "plain", generated views of ground with little texture in fog, at dusk and at
-    night; or a folder of `data` ("quito", "portugal", "caliterra").
+    name: "generated", or a folder of `data` ("quito", "portugal", "caliterra").
     """
     home = folder / name
-    if name == "plain":
-        return _plain_views(load_views("generated", folder, data, count), home, count)
     if name == "generated":
         places = [home / f"{WORLD_SEED + k}" for k in range(-(-count // VIEWS_PER_WORLD))]
         with ProcessPoolExecutor(2) as pool:
@@ -91,71 +85,10 @@ def _make_world(home: Path) -> None:
                    VIEWS_PER_WORLD)  # fmt: skip
 
 
-def _plain_views(views: list[BasinView], home: Path, count: int) -> list[BasinView]:
-    """Views of the generated worlds' plainest ground: of random poses in each world, those whose
-    reference view has the least contrast.
-    """
-    if not (home / "views.npz").exists():
-        home.mkdir(parents=True, exist_ok=True)
-        worlds = list(dict.fromkeys(v.map_cache.parent for v in views))
-        share = -(-count // len(worlds))
-        made = [v for k, world in enumerate(worlds) for v in _plain_of(world, share, 10 + k)]
-        _store(home, made)
-    return load_kept(home)[:count]
-
-
-def _plain_of(world: Path, count: int, seed: int) -> list[BasinView]:
-    rng = np.random.default_rng(seed)
-    half = 0.36 * WORLD_M
-    with (
-        TileStreamer(TileCache.open(world / "survey.cache")) as survey,
-        TileStreamer(TileCache.open(world / "day.cache")) as day,
-    ):
-        map_renderer, day_renderer = NumbaRenderer(survey, 1), NumbaRenderer(day, 1)
-        candidates: list[tuple[float, Pose, Camera, float]] = []
-        while len(candidates) < _PLAIN_FROM * count:
-            truth, camera, height = _random_pose(map_renderer, (half, half), rng)
-            view = map_renderer.render(truth, camera, wait=True)
-            if (view.depth > 0).mean() >= _LEAST_MAP:
-                candidates.append((contrast(view.rgb), truth, camera, height))
-        views: list[BasinView] = []
-        for k, (_, truth, camera, height) in enumerate(sorted(candidates, key=lambda c: c[0])):
-            seen = day_renderer.render(truth, camera, wait=True)
-            if (seen.depth > 0).mean() < _LEAST_MAP or len(views) == count:
-                continue
-            condition = _DULL[k % len(_DULL)]
-            query = _weathered(seen, condition, rng)
-            views.append(BasinView(world / "survey.cache", query, truth, camera, condition, height))
-    return views
-
-
-def contrast(image: Image) -> float:
-    """Median over 16 px blocks of the standard deviation of the grey value, 0 to 255."""
-    grey = image.astype(np.float32).mean(axis=2)
-    h, w = (16 * (n // 16) for n in grey.shape)
-    blocks = grey[:h, :w].reshape(h // 16, 16, w // 16, 16)
-    return float(np.median(blocks.std(axis=(1, 3))))
-
-
 def _make_real(source: Path, home: Path, count: int) -> None:
     home.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
-    rasters = [source / "dsm.tif", source / "ortho.tif"]
-    georef = source / "georef.json"
-    origin = json.loads(georef.read_text())["origin"] if georef.exists() else None
-    cache = home / "map.cache"
-    # Heights only need to agree between map and poses here, so the separation does not matter.
-    build_cache(
-        rasters if rasters[0].exists() else source,
-        cache,
-        BuildOptions(
-            geoid_separation_m=0.0,
-            vertical_datum="ellipsoidal",
-            rules=ImportRules(trusted=frozenset({"geoid"})),
-            origin=Geodetic(origin["lat"], origin["lon"], origin["height"]) if origin else None,
-            overwrite=True,
-        ),
-    )
+    cache = build_map(layers_of(source), home / "map.cache", origin_of(source))
     if (source / "queries").exists():
         _store(home, photo_views(cache, source / "queries"))
     else:

@@ -17,11 +17,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from benchmarks.calibration.report import COLUMNS, rows_of, summary, table
+from benchmarks.calibration.report import COLUMNS, rows_of, summary
 from benchmarks.calibration.run import TRUTH, read, record_draw, solve_draw
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.deadline import deadline
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from sitl.demo.assets import prepare
 
@@ -65,9 +65,8 @@ def main() -> None:
         rows = read(path)
     if rows:
         made = summary(rows)
-        print(table(made))
-        if args.json:
-            write_figures(args.json, COLUMNS, rows_of(made), made)
+        print(f"{made['draws']} draws")
+        show_figures(args.json, COLUMNS, rows_of(made), made)
 
 
 if __name__ == "__main__":

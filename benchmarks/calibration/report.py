@@ -80,24 +80,3 @@ def rows_of(made: dict[str, Any]) -> list[tuple[str, ...]]:
         )  # fmt: skip
     rows.append(("all numbers", "-", "-", "-", "-", "-", f"{100 * made['inside_95_of_all']:.0f} %"))
     return rows
-
-
-def table(made: dict[str, Any]) -> str:
-    """The summary in lines."""
-    lines = [f"{made['draws']} draws"]
-    for name, g in made["groups"].items():
-        lines.append(
-            f"{name}: {g['draws_within']} of {g['draws']} within {g['target']:.3g} {g['unit']}; "
-            f"rms {g['rms']:.3g}, worst {g['worst']:.3g}, sigma {g['sigma_median']:.3g}; "
-            f"{100 * g['inside_95']:.0f} % inside 1.96 sigma"
-        )
-    lines.append(f"all numbers inside 1.96 sigma: {100 * made['inside_95_of_all']:.0f} %")
-    if not made["found_over_true"]:
-        return "\n".join(lines)
-    for name, values in made["flights_after_median_m"].items():
-        lines.append(f"flight after it, {name} deployment: median {np.median(values):.3f} m")
-    lines.append(
-        f"found against true: {np.median(made['found_over_true']):.3f} in the median, "
-        f"{made['within_10_percent']} of {len(made['found_over_true'])} within 10 %"
-    )
-    return "\n".join(lines)

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from scipy.stats import beta
+from typing import Literal
+
+from scipy.stats import binomtest
 
 
 def exact_interval(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share (Clopper and Pearson), in per cent."""
-    low = 0.0 if hits == 0 else float(beta.ppf(0.025, hits, count - hits + 1))
-    high = 1.0 if hits == count else float(beta.ppf(0.975, hits + 1, count - hits))
-    return 100 * low, 100 * high
+    return _interval(hits, count, "exact")
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """95 % interval of a share (Wilson), in per cent."""
+    return _interval(hits, count, "wilson")
+
+
+def _interval(hits: int, count: int, method: Literal["exact", "wilson"]) -> tuple[float, float]:
+    if count == 0:
+        return 0.0, 100.0
+    found = binomtest(hits, count).proportion_ci(0.95, method)
+    return 100 * float(found.low), 100 * float(found.high)

@@ -9,7 +9,6 @@
     python -m benchmarks.features --widths 320 640 --baselines --models shipped NEW.onnx
     python -m benchmarks.features --swarm-alone --baselines     (what draws of the prior add)
     python -m benchmarks.features --tilts 0.5 --baselines       (what roll and pitch add)
-    python -m benchmarks.features --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
 season (feature_real.py says what the real sets are). The reference is rendered 5 m and 5 deg from
@@ -59,8 +58,8 @@ with needs_torch():
         narrowed,
     )
     from benchmarks.features.real import real_pairs
-    from benchmarks.features.report import PairOutcome, read_outcomes, report, write_outcomes
-    from benchmarks.features.tables import TABLES
+    from benchmarks.features.report import PairOutcome, read_outcomes, write_outcomes
+    from benchmarks.features.tables import TABLES, report
 
 _log = logging.getLogger(__name__)
 
@@ -127,21 +126,6 @@ def build_methods(
     return methods
 
 
-def speed(model: Path | None) -> dict[str, float]:
-    """Median milliseconds at 320 x 240 on one and two threads."""
-    image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
-    result = {}
-    for threads in (1, 2):
-        extractor = load_extractor(model, threads=threads)
-        times = []
-        for _ in range(100):
-            began = time.perf_counter()
-            extractor.extract(image)
-            times.append(time.perf_counter() - began)
-        result[f"{threads} threads"] = 1e3 * float(np.median(times[10:]))
-    return result
-
-
 def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
@@ -185,7 +169,6 @@ def parser() -> Parser:
     p.add_argument("--report", type=existing, nargs="+", help="tables of earlier CSVs, no run")
     p.add_argument("--table", choices=TABLES, default="sets", help="that --json keeps")
     p.add_argument("--json", type=output, help="that table of --report, for the documentation")
-    p.add_argument("--speed", action="store_true", help="time of extraction, no run")
     return p
 
 
@@ -215,12 +198,6 @@ def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
 
 def main() -> None:
     args = parser().parse_args()
-    if args.speed:
-        for model in args.models:
-            path = None if model == SHIPPED else model
-            times = speed(path)
-            print(model, {k: f"{v:.1f} ms" for k, v in times.items()})
-        return
     if args.report:
         outcomes = read_outcomes(args.report)
         print(report(outcomes))

@@ -18,21 +18,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.common.maps import build_map, layers_of, origin_of
 from benchmarks.features.pairs import DEGREES, METRES, SIZE, TestPair
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.importers.rules import ImportRules
+from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
 from localizer.training.data.batches import limit_haze
 from localizer.training.data.pairs import SEASON, look_at, moved
-from localizer.training.places.photos import read_photo
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
 
@@ -52,30 +49,16 @@ def real_pairs(
     if (folder / "offsets.csv").exists():
         return _season_pairs(folder, count, seed, size)
     photos = folder / "queries"
-    origin = _origin(folder / "georef.json") if photos.exists() else None
-    with TileStreamer(TileCache.open(_map(folder, cache, origin))) as streamer:
+    with TileStreamer(TileCache.open(_map(folder, cache))) as streamer:
         renderer = NumbaRenderer(streamer)
         if photos.exists():
             return _photo_pairs(renderer, photos, count, seed, size)
         return _rendered_pairs(renderer, count, seed, size)
 
 
-def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
+def _map(folder: Path, cache: Path) -> Path:
     built = cache / f"map-{folder.name}"
-    if not built.exists():
-        layers = [folder / "dsm.tif", folder / "ortho.tif"]
-        # Heights only need to agree between map and poses here, so the separation does not matter.
-        build_cache(
-            layers if layers[0].exists() else folder,
-            built,
-            BuildOptions(
-                geoid_separation_m=0.0,
-                vertical_datum="ellipsoidal",
-                rules=ImportRules(trusted=frozenset({"geoid"})),
-                origin=origin,
-            ),
-        )
-    return built
+    return built if built.exists() else build_map(layers_of(folder), built, origin_of(folder))
 
 
 def _photo_pairs(
@@ -90,7 +73,7 @@ def _photo_pairs(
         rng = np.random.default_rng((seed, k))
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
-        image = read_photo(photos / "images" / names[photo])
+        image = read_rgb(photos / "images" / names[photo])
         query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
@@ -170,7 +153,7 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
     for k in range(count):
         rng = np.random.default_rng((seed, 3, k))
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
-        dates = [read_photo(p) for p in plot_dates(plot)]
+        dates = [read_rgb(p) for p in plot_dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
         view, query, truth = _plot_pair(surveyed, flown, rng, size)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
@@ -189,7 +172,7 @@ def plot_dates(plot: Path) -> list[Path]:
     """The green date, then the dry one."""
 
     def green(path: Path) -> float:
-        red_green_blue = read_photo(path).reshape(-1, 3).mean(0)
+        red_green_blue = read_rgb(path).reshape(-1, 3).mean(0)
         return float(red_green_blue[0] - red_green_blue[1])
 
     return sorted(plot.glob("*.jpg"), key=green)
@@ -233,8 +216,3 @@ def plane_view(ortho: Image, pose: Pose, camera: Camera) -> tuple[Image, Float32
     )
     image[~on] = 0
     return image, np.where(on, depth, 0.0).astype(np.float32)
-
-
-def _origin(georef: Path) -> Geodetic:
-    origin = json.loads(georef.read_text())["origin"]
-    return Geodetic(origin["lat"], origin["lon"], origin["height"])

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from benchmarks.features.report import PairOutcome, difference, groups, wilson
+import numpy as np
+
+from benchmarks.common.figures import markdown
+from benchmarks.common.shares import wilson
+from benchmarks.features.report import PairOutcome, difference
 from localizer.synth.appearance.model import CONDITIONS
 
 Cells = tuple[tuple[str, ...], list[tuple[str, ...]]]  # columns and rows
@@ -24,9 +28,15 @@ def by_set(outcomes: Sequence[PairOutcome]) -> Cells:
 
 
 def by_condition(outcomes: Sequence[PairOutcome]) -> Cells:
-    """A row a kind of pair, a column a method, over all sets."""
+    """A row a kind of pair, a column a method, over all sets; the median errors at the end."""
     named = {"all": list(outcomes)}
-    return _by_method("pairs", named | {k: _of(outcomes, k) for k in _kinds(outcomes)})
+    columns, rows = _by_method("pairs", named | {k: _of(outcomes, k) for k in _kinds(outcomes)})
+    of = [[o for o in outcomes if o.method == m] for m in _methods(outcomes)]
+    medians = (
+        f"{np.median([o.metres for o in mine]):.2f} m, {np.median([o.degrees for o in mine]):.2f}°"
+        for mine in of
+    )
+    return columns, [*rows, ("median error", "", *medians)]
 
 
 def by_light(outcomes: Sequence[PairOutcome]) -> Cells:
@@ -41,15 +51,16 @@ def by_light(outcomes: Sequence[PairOutcome]) -> Cells:
 
 
 def leads(outcomes: Sequence[PairOutcome]) -> Cells:
-    """Points by which the last method leads at 1 m and 1 degree: over all, by set, and at night."""
+    """Points by which the last method leads at 1 m and 1 degree: over all, by set and by kind."""
     *others, last = _methods(outcomes)
-    split = {m: groups([o for o in outcomes if o.method == m]) for m in (*others, last)}
-    wanted = ["all", *(f"{s}: all" for s in _sources(outcomes)), "night"]
+    named = {"all": list(outcomes)}
+    named |= {s: [o for o in outcomes if o.source == s] for s in _sources(outcomes)}
     rows = []
-    for name in (w for w in wanted if w in split[last]):
-        found = (difference(split[last][name], split[m][name]) for m in others)
+    for name, some in (named | {k: _of(outcomes, k) for k in _kinds(outcomes)}).items():
+        mine = [o for o in some if o.method == last]
+        found = (difference(mine, [o for o in some if o.method == m]) for m in others)
         texts = (f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]" for gain, low, high in found)
-        rows.append((name.removesuffix(": all"), str(len(split[last][name])), *texts))
+        rows.append((name, str(len(mine)), *texts))
     return (f"lead of {last}, points", "n", *(f"over {m}" for m in others)), rows
 
 
@@ -78,6 +89,12 @@ TABLES: dict[str, Callable[[Sequence[PairOutcome]], Cells]] = {
     "sets": by_set, "conditions": by_condition, "light": by_light, "leads": leads,
     "against": against,
 }  # fmt: skip
+
+
+def report(outcomes: Sequence[PairOutcome]) -> str:
+    """The tables by set and by kind of pair, and the leads of the last method, as Markdown."""
+    wanted = [by_set, by_condition, *([leads] if len(_methods(outcomes)) > 1 else [])]
+    return "\n\n".join(markdown(*table(outcomes)) for table in wanted)
 
 
 def _by_method(title: str, named: dict[str, list[PairOutcome]]) -> Cells:

@@ -27,12 +27,13 @@ from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing, number, output
 from benchmarks.common.deadline import deadline
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.integrity.fit import fit, fit_table
     from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
-    from benchmarks.integrity.report import by_condition, plot, rows, table
+    from benchmarks.integrity.report import COLUMNS, by_condition, cells, plot, rows
     from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
@@ -50,7 +51,7 @@ def parser() -> Parser:
     p.add_argument("--fit", type=output, help="probability.json from the outcomes that are there")
     p.add_argument("--without", type=existing, help="folder whose outcomes' views are left out")
     p.add_argument("--report", action="store_true", help="tables of what is there; no run")
-    p.add_argument("--json", type=output, help="the report's rows")
+    p.add_argument("--json", type=output, help="the report's table and rows")
     p.add_argument("--plot", type=output, help="PNG: agreement over quality")
     return p
 
@@ -85,11 +86,9 @@ def main() -> None:
         return
     config = IntegrityConfig()
     made = rows(outcomes, config)
-    print(table(made))
+    show_figures(args.json, COLUMNS, cells(made), {"rows": [asdict(r) for r in made]})
     print()
     print(by_condition(outcomes, config))
-    if args.json:
-        args.json.write_text(json.dumps([asdict(r) for r in made], indent=1))
     if args.plot:
         plot(outcomes, config, args.plot)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
-from rasterio.transform import Affine, from_origin
+from rasterio.transform import Affine
 
 from benchmarks.basin.views import (
     SIZE,
@@ -25,10 +25,8 @@ from benchmarks.basin.views import (
     load_views,
     store_renders,
 )
+from benchmarks.common.maps import build_map, write_raster
 from benchmarks.real.sets import load
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
-from localizer.map.importers.rules import ImportRules
 from localizer.pictures import read_rgb
 from localizer.types import Float32, Image
 
@@ -42,7 +40,7 @@ _CHANGED, _CHANGE_M = 0.3, 24.0  # share of an outdated map that has changed, si
 SHIFT_M = (4.0, -3.0)  # of the orthophoto, east and north
 _SIDE_M, _GSD_M, _POST_M = 480.0, 0.2, 0.8  # of a made map, its picture and its heights
 _HALF_M = 140.0  # within which its views look
-_WEST, _NORTH, _CRS = 465_000.0, 5_250_000.0, "EPSG:32632"
+_CORNER, _CRS = (465_000.0, 5_250_000.0), "EPSG:32632"
 
 
 def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]:
@@ -103,7 +101,7 @@ def _outdated(home: Path, folder: Path, data: Path, count: int) -> None:
             changed[:, i : i + h, j : j + w] = array[:, k : k + h, m : m + w]
         with rasterio.open(out, "w", **profile) as file:
             file.write(changed)
-    _build(sources, home / "map.cache")
+    build_map(sources, home / "map.cache")
     true = folder / "portugal" / "map.cache"
     store_renders(home, home / "map.cache", true, (100.0, 110.0), rng, count)
 
@@ -117,7 +115,7 @@ def _shifted(home: Path, folder: Path, data: Path, count: int) -> None:
         with rasterio.open(home / "ortho.tif", "w", **profile) as moved:
             moved.write(ortho.read())
     cache = home / "map.cache"
-    _build([source / "dsm.tif", home / "ortho.tif"], cache)
+    build_map([source / "dsm.tif", home / "ortho.tif"], cache)
     true = folder / "portugal" / "map.cache"
     rng = np.random.default_rng(3)
     store_renders(home, cache, true, (100.0, 110.0), rng, count)
@@ -132,35 +130,12 @@ def _made(home: Path, _folder: Path, data: Path, count: int) -> None:
     for name, seed in (("map", 0), ("day", 1)) if moves else (("map", 0),):
         rgb, height = paint(data, seed)
         sources = [home / f"{name}-dsm.tif", home / f"{name}-ortho.tif"]
-        _write(sources[0], height[None], _POST_M)
-        _write(sources[1], rgb.transpose(2, 0, 1), _GSD_M)
-        _build(sources, home / f"{name}.cache")
+        write_raster(sources[0], height[None], _POST_M, _CRS, _CORNER)
+        write_raster(sources[1], rgb.transpose(2, 0, 1), _GSD_M, _CRS, _CORNER)
+        build_map(sources, home / f"{name}.cache")
     day = home / ("day.cache" if moves else "map.cache")
     rng = np.random.default_rng(11)
     store_renders(home, home / "map.cache", day, (_HALF_M, _HALF_M), rng, count)
-
-
-def _build(sources: list[Path], cache: Path) -> None:
-    build_cache(
-        sources,
-        cache,
-        BuildOptions(
-            geoid_separation_m=0.0,
-            vertical_datum="ellipsoidal",
-            rules=ImportRules(trusted=frozenset({"geoid"})),
-            overwrite=True,
-            workers=1,
-        ),
-    )
-
-
-def _write(path: Path, data: np.ndarray, step: float) -> None:
-    profile = {
-        "driver": "GTiff", "width": data.shape[2], "height": data.shape[1], "count": data.shape[0],
-        "dtype": data.dtype, "crs": _CRS, "transform": from_origin(_WEST, _NORTH, step, step),
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as out:
-        out.write(data)
 
 
 def _noise(rng: np.random.Generator, side: int, wave_px: float) -> Float32:

@@ -19,6 +19,7 @@ Acceptance = Callable[[StartOutcome], bool]
 WITHOUT, LIKELY = "overlap and prediction alone", "log odds, any prior"
 DISTINCT, FOCAL = "log odds by the prior: ours", "log odds, no other focal length"
 OURS = "both: ours on trial"
+COLUMNS = ("set", "acceptance", "accepted, > 3 m or 3° off", "> 10 m off", "right ones lost")
 
 # What is put together beside all: a picture cannot tell a focal length from a distance, nor one of
 # many equal roofs from the next.
@@ -116,14 +117,13 @@ def rows(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> list[Acce
     return made
 
 
-def table(made: Sequence[AcceptanceRow]) -> str:
-    """Shares in per cent with their intervals."""
-    lines = [
-        "| set | acceptance | accepted, > 3 m or 3° off | > 10 m off | right ones lost |",
-        "|---|---|---|---|---|",
+def cells(made: Sequence[AcceptanceRow]) -> list[tuple[str, ...]]:
+    """As `COLUMNS` names them: all acceptances over all sets, and ours on each set."""
+    return [
+        (r.set, r.acceptance, str(r.false), str(r.false_far), str(r.lost))
+        for r in made
+        if r.set in _TOGETHER or r.acceptance == OURS
     ]
-    lines += [f"| {r.set} | {r.acceptance} | {r.false} | {r.false_far} | {r.lost} |" for r in made]
-    return "\n".join(lines)
 
 
 def by_condition(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> str:

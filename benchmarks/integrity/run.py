@@ -25,7 +25,7 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration
 from localizer.registration.agreement import PatchDisplacements
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.tracking.motion import mahalanobis_squared, place_sigma_m
+from localizer.tracking.motion import horizontal_sigma_m
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import Anchors, FeaturePyramid, RegistrationStatus
 
@@ -174,13 +174,13 @@ def _outcome(
         overlap=found.overlap,
         quality=found.quality,
         sigma_m=float(np.sqrt(found.covariance.diagonal()[:3].max())),
-        gate=mahalanobis_squared(begun.prior, pose, found.covariance),
+        gate=begun.prior.mahalanobis_squared(pose, found.covariance),
         parts=votes.patches,
         votes=votes.votes,
         peak=votes.peak,
         lead=min(found.lead, 1e3),
         focal_gain=max(found.focal_gain, -1.0),
-        prior_sigma_m=place_sigma_m(begun.prior),
+        prior_sigma_m=horizontal_sigma_m(begun.prior),
     )
 
 

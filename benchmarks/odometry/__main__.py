@@ -102,9 +102,9 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
                     flush=True,
                 )
             if args.json:
-                document = {"arguments": _plain(args), "rows": rows(flown)}
+                document = {"arguments": vars(args), "rows": rows(flown)}
                 document["flown"] = [asdict(f) for f in flown]
-                args.json.write_text(json.dumps(document))
+                args.json.write_text(json.dumps(document, default=str))
     return flown
 
 
@@ -114,10 +114,6 @@ def read(path: Path) -> list[FlownStretch]:
         FlownStretch(**{**f, "steps": tuple(OdometryStep(**step) for step in f["steps"])})
         for f in json.loads(path.read_text())["flown"]
     ]
-
-
-def _plain(args: argparse.Namespace) -> dict[str, object]:
-    return {key: str(v) if isinstance(v, Path) else v for key, v in vars(args).items()}
 
 
 def main() -> None:

@@ -4,14 +4,11 @@
 
 Device events, median of many after warm-up. One iteration is (7 iterations - 1) / 6 of a launch,
 which starts from the same poses each time.
-Roofline shares are of the float32 peak (multiprocessors x 128 lanes x 2 x clock)
-and of the bandwidth of a device copy measured here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -31,7 +28,6 @@ from localizer.registration.backend import (
     world_from_camera,
 )
 from localizer.registration.config import JNGOConfig
-from localizer.registration.cpu.reference import in_view, project
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.driver import Device
 from localizer.registration.cuda.errors import CudaError
@@ -50,37 +46,6 @@ SCHEDULES = (  # label, settings, anchors
     ("as flown, N=4000 at the end", JNGOConfig(min_overlap=0.01), 4000),
 )
 Poses = tuple[np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True)
-class EvaluationWork:
-    """Of one evaluation of the swarm. flops: float32 operations; requested: bytes that the lanes
-    load; unique: bytes that must come from memory at least once.
-    """
-
-    flops: float
-    requested: float
-    unique: float
-
-
-def count_work(problem: LevelProblem, swarm: Poses, bytes_per_value: int) -> EvaluationWork:
-    """Counted from the kernel's source: 25 operations a channel and about 220 besides."""
-    h, w, C = problem.features.shape
-    touched = np.zeros((h, w), dtype=bool)
-    visible = 0
-    for R, t in zip(*swarm, strict=True):
-        x, uv = project(problem, R, t)
-        seen = in_view(problem, x, uv)
-        column, row = uv[seen].astype(int).T
-        visible += int(seen.sum())
-        for dy in (0, 1):
-            for dx in (0, 1):
-                touched[row + dy, column + dx] = True
-    anchors = problem.points.shape[1]
-    per_anchor = 5 * C * bytes_per_value + 4 * 4 + 4
-    everything = visible * per_anchor + 12 * anchors * len(swarm[0])
-    once = touched.sum() * (C * bytes_per_value + 4) + anchors * (C * bytes_per_value + 16)
-    return EvaluationWork(visible * (25.0 * C + 220.0), float(everything), float(once))
 
 
 def median_ms(device: Device, prepare: Callable[[], None], run: Callable[[], None]) -> float:
@@ -139,15 +104,6 @@ def torch_ms(problem: LevelProblem, swarm: Poses) -> float | None:
     return float(np.median(times))
 
 
-def copy_bandwidth(device: Device, size: int = 2**30) -> float:
-    """Bytes per second read and written by a copy of `size` bytes within the device."""
-    target, source = device.allocate(size), device.allocate(size)
-    ms = median_ms(device, lambda: None, lambda: device.copy(target, source, size))
-    for address in (target, source):
-        device.free(address)
-    return 2 * size / ms * 1e3
-
-
 def pyramid_problem(
     swarm: Poses, channels: int, anchors: int = 500
 ) -> tuple[FeaturePyramid, Camera, Anchors, np.ndarray]:
@@ -202,7 +158,7 @@ def print_tables(
     """
     sizes = tuple(problems)
     rows: dict[str, list[float | None]] = {
-        name: [None] * len(sizes) for name in ("naive PyTorch", "fused float32", "fused float16")
+        name: [None] * len(sizes) for name in ("naive PyTorch", "fused kernel")
     }
     notes = ["GPU: -"]
     schedules: list[tuple[str, ...]] = []
@@ -222,9 +178,9 @@ def print_tables(
     table.add_row("paper: CUDA fused kernel (RTX)", "0.44", "0.47", "0.49")
     console.print(table)
     table = Table(title="GPU: ms per schedule at 128/256/512 px, M=144, C=32")
-    for heading in ("schedule", "features", "upload", "graph", "off by m"):
+    for heading in ("schedule", "upload", "graph", "off by m"):
         table.add_column(heading, justify="right")
-    for row in schedules or [("2/3/4, 144 -> 64 -> 16, N=500", "-", "-", "-", "-")]:
+    for row in schedules or [("2/3/4, 144 -> 64 -> 16, N=500", "-", "-", "-")]:
         table.add_row(*row)
     console.print(table)
     for note in notes:
@@ -232,8 +188,8 @@ def print_tables(
     return [
         *((f"LM iteration, {name}", f"{size} x {size}", "-" if ms is None else f"{ms:.4f}")
           for name, values in rows.items() for size, ms in zip(sizes, values, strict=True)),
-        *((f"registration {label}, {kind}: {part}", "128, 256, 512", ms)
-          for label, kind, *both, _ in schedules
+        *((f"registration {label}: {part}", "128, 256, 512", ms)
+          for label, *both, _ in schedules
           for part, ms in zip(("upload", "graph"), both, strict=True)),
     ]  # fmt: skip
 
@@ -247,30 +203,16 @@ def measure(
     schedules: list[tuple[str, ...]],
 ) -> None:
     """Fill the tables."""
-    bandwidth = copy_bandwidth(device)
-    peak = device.multiprocessors * 128 * 2 * device.clock_hz
-    notes.append(f"copy {bandwidth / 1e12:.2f} TB/s, float32 peak {peak / 1e12:.1f} TFLOP/s")
     for k, problem in enumerate(problems.values()):
         rows["naive PyTorch"][k] = torch_ms(problem, swarm)
-    for half in (False, True):
-        backend = CudaBackend(device, half=half)
-        kind = "float16" if half else "float32"
-        notes.append(f"{kind}: {backend.kernels(32).resources('refine_many')}")
-        for k, problem in enumerate(problems.values()):
-            ms = fused_ms(backend, problem, swarm)
-            rows[f"fused {kind}"][k] = ms
-            work = count_work(problem, swarm, 2 if half else 4)
-            notes.append(
-                f"{kind}, {problem.features.shape[0]} px: {work.flops / ms / 1e9:.2f} TFLOP/s "
-                f"({100 * work.flops / ms * 1e3 / peak:.1f} % of the peak), loads "
-                f"{work.requested / ms / 1e9:.2f} TB/s, must come from memory "
-                f"{work.unique / 1e6:.1f} MB ({100 * work.unique / ms * 1e3 / bandwidth:.1f} % of "
-                "the copy's bandwidth)"
-            )
-        for label, config, anchors in SCHEDULES:
-            upload, graph, error = schedule_ms(backend, swarm, config, anchors)
-            schedules.append((label, kind, f"{upload:.3f}", f"{graph:.3f}", f"{error:.3f}"))
-        backend.close()
+    backend = CudaBackend(device)
+    notes.append(f"{backend.kernels(32).resources('refine_many')}")
+    for k, problem in enumerate(problems.values()):
+        rows["fused kernel"][k] = fused_ms(backend, problem, swarm)
+    for label, config, anchors in SCHEDULES:
+        upload, graph, error = schedule_ms(backend, swarm, config, anchors)
+        schedules.append((label, f"{upload:.3f}", f"{graph:.3f}", f"{error:.3f}"))
+    backend.close()
 
 
 def main() -> None:

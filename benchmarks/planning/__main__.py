@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.deadline import deadline
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.planning.report import COLUMNS, fitted, rows_of, summary
 from benchmarks.planning.run import FlownLeg, read, run_world
@@ -80,12 +80,7 @@ def main() -> None:
         return
     if args.report:
         made = report(read(path))
-        print(json.dumps(made["all"], indent=1))
-        for name, part in made.items():
-            low_high = "{:.2f} [{:.2f}, {:.2f}]".format(*part["auc"])
-            print(f"{name}: {part['legs']} legs, {part['failed']} failed, AUC {low_high}")
-        if args.json:
-            write_figures(args.json, COLUMNS, rows_of(made), made)
+        show_figures(args.json, COLUMNS, rows_of(made), made)
         return
     more_time = deadline(args.minutes)
     for seed, size_m, character in SETS[args.set]:

@@ -5,7 +5,6 @@
     python -m benchmarks.protection --set generated --views 20 --focal 0.05 --out focal.json
     python -m benchmarks.protection --report generated.json caliterra.json --out fit.json
     python -m benchmarks.protection --flights report-loop/* --out flights.json
-    python -m benchmarks.protection --replay report-loop/* --out replayed.json
 
 Sets are those of `python -m benchmarks.basin`: generated worlds of seeds that no training uses on
 another day under made weather, quito (a real mesh), caliterra (real photos). Each view is
@@ -19,10 +18,7 @@ defaults were chosen on (0). A run goes on where its file ends.
 
 With --flights (folders of `python -m sitl loop` or `demo`) it counts how many positions lay inside
 the level that they had in flight: those that were injected, and those that were withheld or flown
-in shadow; and what the monitor said, by finding. With --replay their fixes and the vehicle's
-messages go through the monitor of now: what it would tell and withhold, and what the levels are
-made of; with --calibrated as if their deployments had said when they were calibrated, with --lost 6
-as if no fix had come for 6 s after each 20 s: whatever is withheld then is a false alarm.
+in shadow; and what the monitor said, by finding.
 """
 
 from __future__ import annotations
@@ -34,14 +30,13 @@ from typing import Any
 
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import markdown, write_figures
 from benchmarks.common.named_errors import named_errors
-from benchmarks.protection import flights, replayed
+from benchmarks.protection import flights
 from benchmarks.protection.draws import LENSES
 from benchmarks.protection.fit import RISKS, Coverage, along_axis, coverage, fitted, halves
 from benchmarks.protection.run import FaultOutcome, run
-from companion.integrity_monitor.config import IntegrityMonitorConfig, ProtectionConfig
-from companion.versions import made_by
+from companion.integrity_monitor.config import ProtectionConfig
 from mavlink_bridge.errors import TlogError
 
 _COLUMNS = (
@@ -52,7 +47,7 @@ _COLUMNS = (
 def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
-    p.add_argument("--set", default="generated", help="generated, plain, quito, caliterra")
+    p.add_argument("--set", default="generated", help="generated, quito, caliterra")
     p.add_argument("--views", type=whole(2, 100_000), default=80, help="how many")
     p.add_argument("--draws", type=whole(1, 100), default=2, help="faults of each view")
     p.add_argument("--focal", type=number(-0.2, 0.2), help="share; instead of a drawn one")
@@ -62,9 +57,6 @@ def parser() -> Parser:
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--out", type=output, help="JSON of every outcome, or of the report")
     p.add_argument("--flights", type=existing, nargs="+", help="flown folders, no run")
-    p.add_argument("--replay", type=existing, nargs="+", help="flown folders, once more")
-    p.add_argument("--calibrated", action="store_true", help="with --replay: the cameras are")
-    p.add_argument("--lost", type=number(0, 60), default=0.0, help="with --replay: s, each 20")
     p.add_argument("--report", type=existing, nargs="+", help="earlier files, no run")
     return p
 
@@ -120,17 +112,11 @@ def _row(name: str, c: Coverage) -> tuple[str, ...]:
     """For docs/explanation/integrity.md."""
     return (
         name,
-        f"{c.within_hpl} of {c.frames} [{100 * c.low:.1f}, {100 * c.high:.1f}] %",
+        f"{c.within_hpl} of {c.frames} [{c.low:.1f}, {c.high:.1f}] %",
         f"{c.within_vpl}",
         f"{c.hpl_median_m:.2f}, {c.vpl_median_m:.2f}",
         f"{c.worst_share:.2f}",
     )
-
-
-def table(found: dict[str, Any]) -> str:
-    """The rows of a report, to read."""
-    rows = [found["columns"], ["---"] * len(found["columns"]), *found["rows"]]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def count_flights(folders: list[Path], out: Path | None) -> None:
@@ -148,37 +134,15 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
         write_figures(out, flights.COLUMNS, flights.rows(found), found)
 
 
-def replay_flights(
-    folders: list[Path], out: Path | None, *, calibrated: bool, lost_s: float
-) -> None:
-    """Print what the monitor of now makes of flights; what cannot be replayed is named."""
-    protection = ProtectionConfig().of_camera(calibrated=calibrated)
-    config = IntegrityMonitorConfig(protection=protection)
-    flown, left_out = [], {}
-    for folder in folders:
-        try:
-            flown.append(replayed.replay(folder, config, lost_s))
-        except TlogError as error:
-            left_out[str(folder)] = str(error)
-            print(f"left out: {error}")
-    found = replayed.report(flown) | {"left_out": left_out, "versions": made_by()}
-    print(table(found))
-    if out is not None:
-        out.write_text(json.dumps(found, indent=1, allow_nan=False))
-
-
 def main() -> None:
     args = parser().parse_args()
     if args.flights:
         count_flights(args.flights, args.out)
         return
-    if args.replay:
-        replay_flights(args.replay, args.out, calibrated=args.calibrated, lost_s=args.lost)
-        return
     if args.report:
         found = report([o for path in args.report for o in read(path)])
         print(json.dumps(found["fitted"]))
-        print(table(found))
+        print(markdown(_COLUMNS, found["rows"]))
         if args.out:
             args.out.write_text(json.dumps(found, indent=1))
         return

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import beta
 
+from benchmarks.common.shares import exact_interval
 from benchmarks.protection.run import FaultOutcome
 from companion.integrity_monitor.config import ProtectionConfig
 from companion.integrity_monitor.protection import budget
@@ -74,7 +74,7 @@ def _squares(outcome: FaultOutcome) -> tuple[float, float]:
 @dataclass(frozen=True)
 class Coverage:
     """Of so many frames, how many errors were within HPL and VPL; low, high: exact 95 % interval of
-    the horizontal share.
+    the horizontal share, per cent.
     """
 
     risk: float
@@ -106,13 +106,6 @@ def _level(o: FaultOutcome, config: ProtectionConfig) -> tuple[float, float]:
     """By the budget of its lens, as the flight's table chooses it by the deployment."""
     config = config.of_camera(calibrated=o.lens != "careful")
     return budget(o.sigma_m, o.height_m, (o.speed_mps, 0.0), config)
-
-
-def exact_interval(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share (Clopper and Pearson)."""
-    low = 0.0 if hits == 0 else float(beta.ppf(0.025, hits, count - hits + 1))
-    high = 1.0 if hits == count else float(beta.ppf(0.975, hits + 1, count - hits))
-    return low, high
 
 
 def along_axis(outcomes: Sequence[FaultOutcome]) -> tuple[float, float]:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.protection.fit import exact_interval
+from benchmarks.common.figures import markdown
+from benchmarks.common.shares import exact_interval
 from mavlink_bridge.alerts.alert import OutputAction
 from mavlink_bridge.alerts.catalogue import CATALOGUE
 from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR
@@ -58,9 +59,9 @@ class FlownPositions:
 
 @dataclass(frozen=True)
 class Share:
-    """Positions within HPL and VPL; low, high: exact 95 % interval of the horizontal share, as if
-    they were independent (neighbours are not: so flights are counted, too). flights_whole: flights
-    with every position inside. worst_share: largest error over its HPL.
+    """Positions within HPL and VPL; low, high: exact 95 % interval of the horizontal share, per
+    cent, as if they were independent (neighbours are not: so flights are counted, too).
+    flights_whole: flights with every position inside. worst_share: largest error over its HPL.
     """
 
     flights: int
@@ -161,8 +162,7 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
         [
             name,
             f"{s['flights']}, {s['flights_whole']} whole",
-            f"{s['within_hpl']} of {s['positions']} "
-            f"[{100 * s['low']:.2f}, {100 * s['high']:.2f}] %",
+            f"{s['within_hpl']} of {s['positions']} [{s['low']:.2f}, {s['high']:.2f}] %",
             f"{s['within_vpl']}",
             f"{s['hpl_median_m']:.2f}, {s['vpl_median_m']:.2f}",
             f"{s['worst_share']:.2f}",
@@ -173,15 +173,12 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
 
 def table(found: dict[str, Any]) -> str:
     """For docs/explanation/integrity.md."""
-    lines = [
-        f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows(found))
-    ]
-    lines += [
+    lines = (
         f"\nguardian, {name}: {g['with a finding']} of {g['flights']} with a finding, "
         f"{g['withheld']} withheld"
         for name, g in found["guardian"].items()
-    ]
-    return "\n".join(lines)
+    )
+    return "\n".join([markdown(COLUMNS, rows(found)), *lines])
 
 
 def _case(folder: Path) -> LoopCase | None:

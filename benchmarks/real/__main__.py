@@ -15,33 +15,36 @@ of each image, 45 to 110 m off while they claim 6 m, with roll and pitch known t
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from benchmarks.common.arguments import Parser, output, whole
+from benchmarks.common.figures import markdown, show_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
     from benchmarks.real.report import (
+        DISPLACED,
+        JUDGED,
+        RIVALS,
+        SEARCHED,
         attitude_text,
+        displaced_cells,
         displaced_row,
-        displaced_table,
+        judged_cells,
         judged_row,
-        judged_table,
         plot,
+        rival_cells,
         rival_rows,
-        rival_table,
+        searched_cells,
         searched_row,
-        searched_table,
     )
     from benchmarks.real.rivals import load_rivals, rival_images
     from benchmarks.real.searched import searched_images
     from benchmarks.real.sets import SETS, RealView, describe, load
-from companion.versions import made_by
 
 _JUDGED_AT = 1.0  # degrees of attitude, of rivals and displaced priors
 _ELSEWHERE = {"caliterra": "fengyuan"}  # whose map holds no place of a set; else caliterra's
@@ -77,27 +80,26 @@ def main() -> None:
     views = {name: load(name, args.folder, args.data) for name in args.sets}
     judged: list[JudgedImage] = []
     rows: list[dict[str, Any]] = []
-    result: dict[str, Any] = {"settings": {"width": args.width}, "versions": made_by()}
+    result: dict[str, Any] = {"settings": {"width": args.width}}
     if args.displaced:
-        result["displaced"] = [_displaced(name, views[name], args) for name in args.sets]
-        print(displaced_table(result["displaced"]))
-        _write(result, args.json)
+        found = [_displaced(name, views[name], args) for name in args.sets]
+        more = result | {"displaced": found}
+        show_figures(args.json, DISPLACED, list(map(displaced_cells, found)), more)
         return
     for name in args.sets:
         for attitude in wanted:
             images = list(judged_images(name, describe(name), views[name], attitude, args.width))
             judged += images
             rows.append(judged_row(images))
-            print(judged_table(rows[-1:]).splitlines()[-1], flush=True)
+            print(" | ".join(judged_cells(rows[-1])), flush=True)
     result["judged"] = rows
-    print(judged_table(rows))
     if args.search:
         result["searched"] = [
             searched_row(list(searched_images(name, views[name], _map_of(name, args), args.width)))
             for name in args.sets
             if name in _SEARCHED
         ]
-        print(searched_table(result["searched"]))
+        print(markdown(SEARCHED, list(map(searched_cells, result["searched"]))))
     if args.rivals:
         rivals, at = load_rivals(), [i for i in judged if i.attitude_deg == _JUDGED_AT]
         matched = [
@@ -108,8 +110,9 @@ def main() -> None:
             )
         ]
         result["rivals"] = rival_rows(matched, at)
-        print(rival_table(result["rivals"]))
-    _write(result | {"images": [asdict(i) for i in judged]}, args.json)
+        print(markdown(RIVALS, list(map(rival_cells, result["rivals"]))))
+    result["images"] = [asdict(i) for i in judged]
+    show_figures(args.json, JUDGED, list(map(judged_cells, rows)), result)
     if args.plot:
         plot(judged, args.plot)
 
@@ -121,11 +124,6 @@ def _displaced(name: str, views: Sequence[RealView], args: Any) -> dict[str, Any
         for seed in range(args.displaced)
     ]
     return displaced_row(list(itertools.chain.from_iterable(images)))
-
-
-def _write(result: dict[str, Any], path: Path | None) -> None:
-    if path is not None:
-        path.write_text(json.dumps(result, indent=1))
 
 
 def _map_of(name: str, args: Any) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,27 +49,25 @@ def judged_row(images: Sequence[JudgedImage]) -> dict[str, Any]:
     }
 
 
-def judged_table(rows: Iterable[dict[str, Any]]) -> str:
-    """One line for each set and attitude."""
-    lines = [
-        "| set | attitude | images | right | accepted of right | wrong accepted | horizontal m, "
-        "p95 | NEES | attitude NEES | inside 95 % | level m | beyond level |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        head = (
-            f"| {r['set']} | {r['attitude']} | {r['images']} | {100 * r['right']:.0f} % "
-            f"| {100 * r['accepted_of_right']:.0f} % | {r['wrong_accepted']} "
-        )
-        rest = "| - | - | - | - | - | - |"
-        if "nees" in r:
-            rest = (
-                f"| {r['horizontal_m']:.2f}, {r['horizontal_p95_m']:.2f} | {r['nees']:.2f} "
-                f"| {r['nees_attitude']:.2f} | {100 * r['inside']:.0f} % | {r['level_m']:.1f} "
-                f"| {r['beyond_level']} |"
-            )
-        lines.append(head + rest)
-    return "\n".join(lines)
+JUDGED = (
+    "set", "attitude", "images", "right", "accepted of right", "wrong accepted",
+    "horizontal m, p95", "NEES", "attitude NEES", "inside 95 %", "level m", "beyond level",
+)  # fmt: skip
+
+
+def judged_cells(r: dict[str, Any]) -> tuple[str, ...]:
+    """A `judged_row` as `JUDGED` names it."""
+    head = (
+        r["set"], r["attitude"], str(r["images"]), f"{100 * r['right']:.0f} %",
+        f"{100 * r['accepted_of_right']:.0f} %", str(r["wrong_accepted"]),
+    )  # fmt: skip
+    if "nees" not in r:
+        return *head, *("-",) * (len(JUDGED) - len(head))
+    return (
+        *head, f"{r['horizontal_m']:.2f}, {r['horizontal_p95_m']:.2f}", f"{r['nees']:.2f}",
+        f"{r['nees_attitude']:.2f}", f"{100 * r['inside']:.0f} %", f"{r['level_m']:.1f}",
+        str(r["beyond_level"]),
+    )  # fmt: skip
 
 
 def displaced_row(images: Sequence[JudgedImage]) -> dict[str, Any]:
@@ -86,20 +84,22 @@ def displaced_row(images: Sequence[JudgedImage]) -> dict[str, Any]:
     }
 
 
-def displaced_table(rows: Iterable[dict[str, Any]]) -> str:
-    """One line for each set."""
-    lines = [
-        "| set, priors 45 to 110 m off | registrations | wrong | wrong accepted | farthest m "
-        "| beyond level |",
-        "|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        farthest = "-" if r["farthest_m"] is None else f"{r['farthest_m']:.1f}"
-        lines.append(
-            f"| {r['set']} | {r['registrations']} | {r['wrong']} | {r['wrong_accepted']} "
-            f"| {farthest} | {r['beyond_level']} |"
-        )
-    return "\n".join(lines)
+DISPLACED = (
+    "set, priors 45 to 110 m off", "registrations", "wrong", "wrong accepted", "farthest m",
+    "beyond level",
+)  # fmt: skip
+
+
+def displaced_cells(r: dict[str, Any]) -> tuple[str, ...]:
+    """A `displaced_row` as `DISPLACED` names it."""
+    return (
+        r["set"], str(r["registrations"]), str(r["wrong"]), str(r["wrong_accepted"]),
+        _metres(r["farthest_m"]), str(r["beyond_level"]),
+    )  # fmt: skip
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
 
 
 def searched_row(images: Sequence[SearchedImage]) -> dict[str, Any]:
@@ -117,20 +117,18 @@ def searched_row(images: Sequence[SearchedImage]) -> dict[str, Any]:
     }
 
 
-def searched_table(rows: Iterable[dict[str, Any]]) -> str:
-    """One line for each set."""
-    lines = [
-        "| set | images | found within 6 m | farther | farthest m | on another map: found "
-        "| median s |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        far = "-" if r["farthest_m"] is None else f"{r['farthest_m']:.1f}"
-        lines.append(
-            f"| {r['set']} | {r['images']} | {r['found']} | {r['wrong']} | {far} "
-            f"| {r['found_on_another_map']} of {r['on_another_map']} | {r['seconds']:.1f} |"
-        )
-    return "\n".join(lines)
+SEARCHED = (
+    "set", "images", "found within 6 m", "found farther off", "farthest m",
+    "found on another map", "median s",
+)  # fmt: skip
+
+
+def searched_cells(r: dict[str, Any]) -> tuple[str, ...]:
+    """A `searched_row` as `SEARCHED` names it."""
+    return (
+        r["set"], str(r["images"]), str(r["found"]), str(r["wrong"]), _metres(r["farthest_m"]),
+        f"{r['found_on_another_map']} of {r['on_another_map']}", f"{r['seconds']:.1f}",
+    )  # fmt: skip
 
 
 def rival_rows(rivals: Sequence[RivalImage], ours: Sequence[JudgedImage]) -> list[dict[str, Any]]:
@@ -153,16 +151,13 @@ def rival_rows(rivals: Sequence[RivalImage], ours: Sequence[JudgedImage]) -> lis
     return rows
 
 
-def rival_table(rows: Iterable[dict[str, Any]]) -> str:
-    """One line for each set and method."""
-    lines = ["| set | method | middle of the image m | right | s |", "|---|---|---|---|---|"]
-    for r in rows:
-        took = "-" if r["seconds"] is None else f"{r['seconds']:.2f}"
-        lines.append(
-            f"| {r['set']} | {r['method']} | {r['centre_m']:.2f} | {100 * r['right']:.0f} % "
-            f"| {took} |"
-        )
-    return "\n".join(lines)
+RIVALS = ("set", "method", "middle of the image m", "right", "s")
+
+
+def rival_cells(r: dict[str, Any]) -> tuple[str, ...]:
+    """One of `rival_rows` as `RIVALS` names it."""
+    took = "-" if r["seconds"] is None else f"{r['seconds']:.2f}"
+    return r["set"], r["method"], f"{r['centre_m']:.2f}", f"{100 * r['right']:.0f} %", took
 
 
 def plot(images: Sequence[JudgedImage], path: Path) -> None:

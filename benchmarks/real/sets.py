@@ -13,21 +13,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import rasterio
 from pydantic import BaseModel, ConfigDict, Field
-from rasterio.transform import from_origin
 
 from benchmarks.basin.views import BasinView, load_views
+from benchmarks.common.maps import build_map, origin_of, write_raster
 from benchmarks.features.real import plot_dates, unseen_plots
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
 from localizer.geometry.posefile import read_poses, world_from_camera
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.importers.rules import ImportRules
 from localizer.pictures import read_rgb
 from localizer.registration.calibration import CalibrationSigmas
 from localizer.render.numba_raster import NumbaRenderer
@@ -112,10 +107,8 @@ def load(name: str, work: Path, data: Path) -> list[RealView]:
 def _photos(described: SetDescription, home: Path, data: Path) -> list[RealView]:
     cache = home / "photo-map.cache"
     if not cache.exists():
-        georef = (data / described.map_files[0]).with_name("georef.json")
-        origin = json.loads(georef.read_text())["origin"] if georef.exists() else None
-        place = Geodetic(origin["lat"], origin["lon"], origin["height"]) if origin else None
-        _build([data / file for file in described.map_files], cache, place)
+        files = [data / file for file in described.map_files]
+        build_map(files, cache, origin_of(files[0].parent))
     photos = data / described.photos
     camera = Camera.from_json(photos / "camera.json")
     frame = TileCache.open(cache).frame
@@ -166,24 +159,6 @@ def _plot_map(home: Path, picture: Path) -> Path:
     flat = np.zeros((1, side, side), np.float32)
     layers = (("ortho", rgb.transpose(2, 0, 1), _PLOT_GSD_M), ("dsm", flat, 1.0))
     for name, array, step in layers:
-        profile = {
-            "driver": "GTiff", "width": array.shape[2], "height": array.shape[1],
-            "count": array.shape[0], "dtype": array.dtype, "crs": "EPSG:32611",
-            "transform": from_origin(260_000.0, 4_110_000.0, step, step),
-        }  # fmt: skip
-        with rasterio.open(home / f"{name}.tif", "w", **profile) as out:
-            out.write(array)
-    _build([home / "dsm.tif", home / "ortho.tif"], cache, None)
+        write_raster(home / f"{name}.tif", array, step, "EPSG:32611", (260_000.0, 4_110_000.0))
+    build_map([home / "dsm.tif", home / "ortho.tif"], cache)
     return cache
-
-
-def _build(sources: list[Path], cache: Path, origin: Geodetic | None) -> None:
-    # Heights only need to agree between map and poses here, so the separation does not matter.
-    build_cache(
-        sources,
-        cache,
-        BuildOptions(
-            geoid_separation_m=0.0, vertical_datum="ellipsoidal", origin=origin, workers=1,
-            rules=ImportRules(trusted=frozenset({"geoid"})), overwrite=True,
-        ),
-    )  # fmt: skip

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, output, whole
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.relocalization.run import (
     COLUMNS,
@@ -31,7 +31,6 @@ from benchmarks.relocalization.run import (
     ViewSearch,
     cells,
     run,
-    table,
     with_threads,
 )
 from localizer.config import LocalizerConfig
@@ -40,7 +39,7 @@ from localizer.config import LocalizerConfig
 def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
-    p.add_argument("--set", default="generated", help="generated, plain, quito, caliterra")
+    p.add_argument("--set", default="generated", help="generated, quito, caliterra")
     p.add_argument("--views", type=whole(1, 100_000), default=40, help="how many")
     p.add_argument(
         "--heading", choices=("known", "unknown", "both"), default="both", help="to 15 degrees"
@@ -61,9 +60,7 @@ def main() -> None:
     args = parser().parse_args()
     if args.report:
         rows = [ViewOutcome(**row) for path in args.report for row in json.loads(path.read_text())]
-        print(table(rows))
-        if args.json:
-            write_figures(args.json, COLUMNS, cells(rows))
+        show_figures(args.json, COLUMNS, cells(rows))
         return
     config = with_threads(LocalizerConfig(), args.threads)
     views = load_views(args.set, args.cache, args.data, args.views)
@@ -76,9 +73,7 @@ def main() -> None:
             outcomes.append(outcome)
             if args.out:  # after each one: an interrupted run keeps what it has
                 args.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
-    print(table(outcomes))
-    if args.json:
-        write_figures(args.json, COLUMNS, cells(outcomes))
+    show_figures(args.json, COLUMNS, cells(outcomes))
 
 
 if __name__ == "__main__":

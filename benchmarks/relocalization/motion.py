@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.basin.views import SIZE, ground_height
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
-from benchmarks.common.figures import markdown, write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from benchmarks.common.shares import exact_interval
 from benchmarks.odometry.stretches import StretchPlan, TestStretch, make_stretch
@@ -271,7 +271,7 @@ def run(
 
 def share(hits: int, count: int) -> dict[str, float]:
     """With its exact 95 % interval, per cent."""
-    low, high = exact_interval(hits, count) if count else (0.0, 100.0)
+    low, high = exact_interval(hits, count)
     return {"hits": hits, "count": count, "low": low, "high": high}
 
 
@@ -327,11 +327,6 @@ def cells(rows: Sequence[dict[str, object]]) -> list[tuple[str, ...]]:
     return made
 
 
-def table(rows: Sequence[dict[str, object]]) -> str:
-    """One line a row."""
-    return markdown(COLUMNS, cells(rows))
-
-
 def main() -> None:
     p = Parser(__doc__)
     p.add_argument("folder", type=existing, nargs="?", help="of worlds and maps")
@@ -366,9 +361,7 @@ def main() -> None:
             known = args.heading == "known"
             run(site, kept, args.first, args.trials, known, more_time, save)
     rows = shares(kept)
-    print(table(rows))
-    if args.json:
-        write_figures(args.json, COLUMNS, cells(rows), {"shares": rows})
+    show_figures(args.json, COLUMNS, cells(rows), {"shares": rows})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.basin.views import BasinView
-from benchmarks.common.figures import markdown
 from benchmarks.common.shares import exact_interval
 from localizer.config import LocalizerConfig
 from localizer.evaluation.places import SimulatedPlaceData
@@ -149,11 +148,6 @@ def _row(name: str, known: bool, condition: str, some: Sequence[ViewOutcome]) ->
         f"{hits} ({low:.0f} to {high:.0f} %)", str(sum(o.false for o in some)),
         f"{cpu:.2f}, {confirm:.2f}", f"{wall:.2f}",
     )  # fmt: skip
-
-
-def table(outcomes: Sequence[ViewOutcome]) -> str:
-    """As Markdown has it."""
-    return markdown(COLUMNS, cells(outcomes))
 
 
 def with_threads(config: LocalizerConfig, threads: int) -> LocalizerConfig:

@@ -1,6 +1,6 @@
 """The documentation's generated parts, written anew.
 
-    python -m benchmarks.site            # command line, configuration, API, alerts; results
+    python -m benchmarks.site            # the alerts' page, the results' tables
     python -m benchmarks.site --check    # ends with 1 and names what is not of today
     python -m benchmarks.site --figures  # of the results pages
     python -m benchmarks.site --pictures report    # the README's, of `make demo`'s report folder
@@ -16,10 +16,8 @@ from pathlib import Path
 from benchmarks.common.arguments import Parser, existing
 from benchmarks.common.named_errors import named_errors
 from benchmarks.site.alerts import alerts_page
-from benchmarks.site.api import api_page
 from benchmarks.site.figures import draw_all
 from benchmarks.site.kept import DATA, with_tables
-from benchmarks.site.pages import command_page, configuration_page
 from benchmarks.site.pictures import keep
 
 _ROOT = Path(__file__).parents[2]
@@ -27,17 +25,11 @@ _ROOT = Path(__file__).parents[2]
 
 def pages() -> dict[Path, str]:
     """Path from the repository's root to the text that must stand there."""
-    reference = Path("docs/reference")
     results = {
         path.relative_to(_ROOT): with_tables(path.read_text(encoding="utf-8"), _ROOT / DATA)
         for path in (_ROOT / "docs").rglob("*.md")
     }
-    return results | {
-        reference / "cli.md": command_page(),
-        reference / "configuration.md": configuration_page(),
-        reference / "api.md": api_page(),
-        reference / "alerts.md": alerts_page(),
-    }
+    return results | {Path("docs/reference/alerts.md"): alerts_page()}
 
 
 def outdated(root: Path) -> list[Path]:

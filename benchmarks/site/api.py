@@ -14,8 +14,7 @@ import localizer
 
 _HEAD = """# API of `localizer`
 
-This page is for whoever uses the localizer as a Python library. It is made from the docstrings by
-`python -m benchmarks.site`; do not edit. Everything here is imported as
+This page is for whoever uses the localizer as a Python library. Everything here is imported as
 `from localizer import NAME` and is stable; other names may change. Terms, frames, heights and time:
 [architecture](../explanation/architecture.md). Angles: [angles](angles.md). More examples:
 [examples/](../../examples). One photo is localized like this

@@ -7,13 +7,10 @@ from __future__ import annotations
 
 import json
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.shares import exact_interval
-from benchmarks.real.report import displaced_table, judged_table
 from benchmarks.site.kept import PrintedTable
 from companion.errors import ReportError
 from sitl.demo.scenario import ScenarioError
@@ -26,18 +23,9 @@ _FLIGHT = (
 )  # fmt: skip
 _SEQUENCE = ("sequence", "frames", "median", "p95, m", "R@1 / 3 / 5, %", "complete, %", "frames/s")
 _SUITE = ("scenario", "what happens", "vehicle", "EKF median / p95 / max, m", "verdict")
-_INTEGRITY = ("set", "acceptance", "accepted, > 3 m or 3° off", "> 10 m off", "right ones lost")
-_ACCEPTANCES = ("no added test", "parts agree", "parts agree, stands out: ours")
-_PLACES = (
-    "set", "heading", "by day", "dusk", "night", "all", "false", "processor s: search, confirm",
-)  # fmt: skip
 _FOLLOWED = (
     "flight", "followed", "seen, of reports", "back after a roof, s", "median / p95 / max, m",
     "inside its 95 %", "velocity p95, m/s", "of something else",
-)  # fmt: skip
-_THROUGHPUT = (
-    "width", "cores", "frames offered", "frames", "frames/s", "latency p50 / p95, ms",
-    "CPU ms a frame", "share of the cores", "median / p95 error, m",
 )  # fmt: skip
 
 
@@ -72,8 +60,7 @@ def _form(data: Any) -> Callable[[list[Any], str], PrintedTable]:
     marks = data if isinstance(data, dict) else data[0]
     for mark, made in (
         ("columns", _figures), ("recall_1", _sequence), ("begin_ns", _followed),
-        ("verdict", _suite), ("acceptance", _integrity), ("search_cpu_s", _places),
-        ("rows", _throughput), ("displaced", _displaced), ("judged", _judged),
+        ("verdict", _suite),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -83,29 +70,6 @@ def _form(data: Any) -> Callable[[list[Any], str], PrintedTable]:
 def _figures(data: list[Any], _title: str) -> PrintedTable:
     rows = (tuple(map(str, row)) for one in data for row in one["rows"])
     return PrintedTable(tuple(data[0]["columns"]), tuple(rows))
-
-
-def _displaced(data: list[Any], _title: str) -> PrintedTable:
-    return _of_markdown(displaced_table(data[0]["displaced"]))
-
-
-def _judged(data: list[Any], _title: str) -> PrintedTable:
-    return _of_markdown(judged_table(data[0]["judged"]))
-
-
-def _throughput(data: list[Any], _title: str) -> PrintedTable:
-    """Without the stages, which are of another shape."""
-    rows = tuple(
-        (
-            str(one["width"]), str(one["cores"]), one["offered"],
-            f"{one['frames_answered']} of {one['frames_offered']}", f"{one['frames_per_s']:.1f}",
-            f"{one['latency_p50_ms']:.0f} / {one['latency_p95_ms']:.0f}",
-            f"{one['cpu_ms_per_frame']:.1f}", f"{one['share_percent']:.0f} %",
-            f"{one['median_m']:.2f} / {one['p95_m']:.2f}",
-        )
-        for part in data for one in part["rows"] if "stage_ms" not in one
-    )  # fmt: skip
-    return PrintedTable(_THROUGHPUT, rows)
 
 
 def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> PrintedTable:
@@ -196,58 +160,6 @@ def _pursuit(row: dict[str, Any]) -> tuple[str, ...]:
         f"{verdict['inside_percent']:.0f} %", f"{verdict['velocity_p95_mps']:.2f}",
         str(verdict["foreign"]),
     )  # fmt: skip
-
-
-def _integrity(data: list[Any], _title: str) -> PrintedTable:
-    rows = (
-        (one["set"], one["acceptance"], *(_rate(one[k]) for k in ("false", "false_far", "lost")))
-        for part in data
-        for one in part
-        if one["acceptance"].endswith("ours on trial")
-        or (one["set"].startswith("all") and one["acceptance"] in _ACCEPTANCES)
-    )
-    return PrintedTable(_INTEGRITY, tuple(rows))
-
-
-def _rate(rate: dict[str, float]) -> str:
-    share = 100 * rate["hits"] / max(rate["count"], 1)
-    interval = f"[{rate['low']:.2f}, {rate['high']:.2f}]"
-    return f"{rate['hits']} of {rate['count']}, {share:.2f} {interval}"
-
-
-def _places(data: list[Any], _title: str) -> PrintedTable:
-    outcomes = [one for part in data for one in part]
-    rows = []
-    for name, known in dict.fromkeys((o["set"], o["heading_known"]) for o in outcomes):
-        mine = [o for o in outcomes if (o["set"], o["heading_known"]) == (name, known)]
-        rows.append(_place(f"{name}, {mine[0]['area_km2']:.2g} km²", known, mine))
-    for known in (True, False):
-        mine = [o for o in outcomes if o["heading_known"] is known]
-        if len({o["set"] for o in mine}) > 1:
-            rows.append(_place("together", known, mine))
-    return PrintedTable(_PLACES, tuple(rows))
-
-
-def _place(name: str, known: bool, mine: Sequence[dict[str, Any]]) -> tuple[str, ...]:
-    by = {light: [o for o in mine if o["condition"] == light] for light in ("dusk", "night")}
-    by["day"] = [o for o in mine if o["condition"] in ("day", "photo")]
-    cost = (statistics.median(o[key] for o in mine) for key in ("search_cpu_s", "verify_cpu_s"))
-    return (
-        name,
-        "15°" if known else "unknown",
-        *(_share(by[light]) for light in ("day", "dusk", "night")),
-        _share(mine),
-        str(sum(o["false"] for o in mine)),
-        ", ".join(f"{s:.2f}" for s in cost),
-    )
-
-
-def _share(some: Sequence[dict[str, Any]]) -> str:
-    if not some:
-        return "-"
-    hits = sum(o["found"] for o in some)
-    low, high = exact_interval(hits, len(some))
-    return f"{hits} of {len(some)} [{low:.0f}, {high:.0f}]"
 
 
 def _short(percent: float) -> str:

@@ -1,4 +1,4 @@
-"""mkdocs' hooks: a page that links to a file beside docs/ finds it in the site, too.
+"""mkdocs' hooks: the pages made from the program, and the files beside docs/ that pages link to.
 
 Pages link to sources as they lie in the repository (`../../configs/deployment.yaml`), so that the
 links hold wherever the repository is read. The site has only what lies under docs/: each linked
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import posixpath
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,15 @@ _THEMES_WORKER = "https://unpkg.com/iframe-worker/shim"
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add a page for every file outside of docs/ that a page links to, and those that it links."""
+    """Add the pages made from the program, and one for every file outside of docs/ that is linked.
+
+    A file that such a page links to gets a page, too.
+    """
+    sys.path.insert(0, str(_ROOT))  # the command `mkdocs` finds installed packages only
+    from benchmarks.site.pages import built_pages
+
+    for name, text in built_pages().items():
+        files.append(File.generated(config, name, content=text))
     waiting = [
         (posixpath.join("docs", file.src_uri), file.content_string)
         for file in files.documentation_pages()

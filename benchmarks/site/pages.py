@@ -1,13 +1,8 @@
-"""The reference pages that are made from the program itself.
-
-The command line's from its commands, the configuration's from its schema: so they cannot say
-anything else than the program.
-"""
+"""The reference pages that only the site has, made from the program itself."""
 
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -18,13 +13,13 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import typer
 from typer.models import ArgumentInfo, OptionInfo
 
+from benchmarks.site.api import api_page
 from companion.cli.commands import app
-from companion.setup.reference import reference
 
 _CLI = """# Command line
 
-Every command of `companion` with its arguments and options, for whoever runs it. Made from the
-commands by `python -m benchmarks.site`; do not edit. `companion COMMAND --help` prints the same.
+Every command of `companion` with its arguments and options, for whoever runs it.
+`companion COMMAND --help` prints the same.
 
 Names in capitals are arguments, given in the order of the table; `...` means one or more. Options
 take an integer N, a number X, TEXT, a PATH or one of the listed words; an option without these is a
@@ -41,20 +36,6 @@ The last words of a meaning, such as 1 to 170, are the allowed range.
 | 130 | interrupted (a flying `run` ends with 0) |
 """
 
-_CONFIGURATION = """# Configuration
-
-Every key of the deployment file, for whoever writes one. `companion init FILE` writes one; it needs
-only the keys that differ from this page. When to change what:
-[configs/deployment.yaml](../../configs/deployment.yaml). This page is made from the schema by
-`python -m benchmarks.site`; do not edit. `companion init --reference` prints the same.
-
-Every value is the default; the value of a required key is an example. The comment above a key
-describes it, with the allowed range ([1, 255] with both ends, (0, 1] without 0) or the allowed
-words. A part that is off is `null`; its keys are commented out. Unknown keys and values out of
-range are refused by name.
-"""
-
-_TOP = re.compile(r"^(\w+):", re.M)
 _KINDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 
 
@@ -89,8 +70,12 @@ class _Parameter:
         return self.default is inspect.Parameter.empty
 
 
-def command_page() -> str:
-    """docs/reference/cli.md."""
+def built_pages() -> dict[str, str]:
+    """Path below docs/ to the text of each page that is written when the site is built."""
+    return {"reference/cli.md": _command_page(), "reference/api.md": api_page()}
+
+
+def _command_page() -> str:
     lines = [_CLI]
     for name, function in _commands("companion", app):
         parameters = list(_parameters(function))
@@ -100,31 +85,6 @@ def command_page() -> str:
             lines += ["| argument, option | default | meaning |", "|---|---|---|"]
             lines += [*map(_row, parameters), ""]
     return "\n".join(lines)
-
-
-def configuration_page() -> str:
-    """docs/reference/configuration.md."""
-    text = reference().split("\n", 2)[2]  # without its head of two lines
-    lines, block = [_CONFIGURATION], list[str]()
-    name = ""
-    for line in text.splitlines():
-        block.append(line)
-        top = _TOP.match(line)
-        if top is not None:
-            lines += _section(name, block, top.group(1))
-            name = top.group(1)
-    return "\n".join([*lines, *block, "```", ""])
-
-
-def _section(before: str, block: list[str], name: str) -> list[str]:
-    """Ends the section before and begins the next; its first comments belong to its own block."""
-    key = block.pop()
-    comments: list[str] = []
-    while block and block[-1].startswith("#"):
-        comments.insert(0, block.pop())
-    ended = [*block, "```", ""] if before else block[:]
-    block[:] = [*comments, key]
-    return [*ended, f"## {name}\n", "```yaml"]
 
 
 def _commands(name: str, group: typer.Typer) -> Iterator[tuple[str, Callable[..., Any]]]:

@@ -1,11 +1,11 @@
 """Targets against the truth: standing ones on plain ground and at edges, and moving cars.
 
-    python -m benchmarks.targets SEED [--scenario FILE] [--method track|filter] [--json out.json]
+    python -m benchmarks.targets SEED [--scenario FILE] [--json out.json]
 
 Flies a scenario over a generated world (`python -m sitl world` or the demo makes it) without
 pictures: the poses err as a registration's do, the pixels as a detector's; an edge's pixel is
 within four of a leap in depth. Rays are cast into the survey's finest tiles, truth is on those of
-today's world. filter is what flew before: one pixel after the other in `TargetFilter` alone.
+today's world.
 """
 
 from __future__ import annotations
@@ -32,10 +32,8 @@ from benchmarks.targets.report import FixSample, rows
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
-from localizer.targets.filter import TargetFilter
-from localizer.targets.locate import RayCaster, locate
 from localizer.targets.track import TargetSettings, TargetTrack
-from localizer.types import PoseEstimate, TargetFix, TargetSighting
+from localizer.types import TargetFix
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import camera_path
@@ -44,23 +42,6 @@ from sitl.demo.scenario import load_scenario
 _SETTINGS = TargetSettings()
 _LOOKED_S = 20.0  # at most: a target is looked at, then left
 _NEW_S = 10.0  # out of sight for so long, a target is looked at anew
-
-
-class _Before:
-    """The filter alone, with every sighting's rays, as it flew before tracks."""
-
-    refusal = ""
-
-    def __init__(self, name: str, cast: RayCaster) -> None:
-        self._name, self._cast, self._filter = name, cast, TargetFilter()
-
-    def observe(self, estimate: PoseEstimate, pixel: tuple[float, float]) -> TargetFix | None:
-        sigmas = _SETTINGS.pixel_sigma, _SETTINGS.map_sigma_m
-        surfaces = locate(estimate, pixel, self._cast, *sigmas)
-        if not surfaces:
-            return None
-        time_ns = estimate.exposure_time_ns
-        return self._filter.update(TargetSighting(self._name, surfaces, pixel, time_ns))
 
 
 def measure(
@@ -73,18 +54,14 @@ def measure(
     """The thing's fixes, how many sightings gave none, and how many there were."""
     rng = np.random.default_rng([args.draw, len(thing.name), hash_of(thing.name)])
     samples, refused, count = [], 0, 0
-    track: TargetTrack | _Before | None = None
+    track: TargetTrack | None = None
     began_ns = last_ns = 0
     for k, pixel in sightings(thing, flown, seen.cast, args.noise, rng):
         told = flown[k].told
         time_ns = told.exposure_time_ns
         if track is None or time_ns - last_ns > _NEW_S * 1e9:
             began_ns = time_ns
-            track = (
-                TargetTrack(thing.name, _SETTINGS, known.cast)
-                if args.method == "track"
-                else _Before(thing.name, known.cast)
-            )
+            track = TargetTrack(thing.name, _SETTINGS, known.cast)
         last_ns = time_ns
         if time_ns - began_ns > _LOOKED_S * 1e9:
             continue
@@ -145,14 +122,10 @@ def fly(args: argparse.Namespace) -> list[dict[str, object]]:
         samples, refused, count = samples + new, refused + not_told, count + of
         found = rows(samples, refused, count)
         if args.json:
-            document = {"arguments": _plain(args), "rows": found}
+            document = {"arguments": vars(args), "rows": found}
             document["samples"] = [asdict(s) for s in samples]
-            args.json.write_text(json.dumps(document))
+            args.json.write_text(json.dumps(document, default=str))
     return found
-
-
-def _plain(args: argparse.Namespace) -> dict[str, object]:
-    return {key: str(v) if isinstance(v, Path) else v for key, v in vars(args).items()}
 
 
 def main() -> None:
@@ -162,7 +135,6 @@ def main() -> None:
                         help="flight that is flown over it")  # fmt: skip
     parser.add_argument("--height", type=number(21, 1000), help="of all legs, m; none: its own")
     parser.add_argument("--size", type=number(100, 10_000), default=1600.0, help="of the world, m")
-    parser.add_argument("--method", choices=("track", "filter"), default="track", help="see above")
     parser.add_argument("--points", type=whole(0, 1000), default=20, help="plain, and at edges")
     parser.add_argument("--cars", type=whole(0, 200), default=10, help="in the world")
     parser.add_argument("--rate", type=number(0.5, 30), default=5.0, help="sightings per second")

@@ -16,16 +16,24 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.arguments import Parser, number, output, whole
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.throughput.settings import OFFERED, one_setting
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
+
+COLUMNS = (
+    "width", "cores", "frames offered", "frames", "frames/s", "latency p50 / p95, ms",
+    "CPU ms a frame", "share of the cores", "median / p95 error, m",
+)  # fmt: skip
 
 
 def scenario(rate_hz: float = 30.0) -> Scenario:
@@ -54,7 +62,7 @@ def record(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Every width and number of cores, one process after the other."""
-    found: list[dict[str, object]] = []
+    found: list[dict[str, Any]] = []
     for width in args.widths:
         for cores in args.cores:
             stages = cores == max(args.cores)
@@ -65,8 +73,21 @@ def run(args: argparse.Namespace) -> None:
                 found += job.result()
             for row in found[-len(OFFERED) - stages :]:
                 print(json.dumps(row), flush=True)
-            if args.json:
-                args.json.write_text(json.dumps({"rows": found}, indent=1) + "\n")
+    show_figures(args.json, COLUMNS, cells(found), {"rows": found})
+
+
+def cells(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """The engine's rows as `COLUMNS` names them, without the stages, which are of another shape."""
+    return [
+        (
+            str(r["width"]), str(r["cores"]), r["offered"],
+            f"{r['frames_answered']} of {r['frames_offered']}", f"{r['frames_per_s']:.1f}",
+            f"{r['latency_p50_ms']:.0f} / {r['latency_p95_ms']:.0f}",
+            f"{r['cpu_ms_per_frame']:.1f}", f"{r['share_percent']:.0f} %",
+            f"{r['median_m']:.2f} / {r['p95_m']:.2f}",
+        )
+        for r in rows if "stage_ms" not in r
+    ]  # fmt: skip
 
 
 def main() -> None:

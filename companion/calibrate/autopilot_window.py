@@ -52,7 +52,9 @@ class AutopilotWindow:
         return bool(np.isfinite(self.place).all())
 
     def motion(self, offset_s: float = 0.0) -> tuple[Array, Array]:
-        """Angular rate of the camera, rad/s, and velocity, m/s, at an offset, world axes (3,)."""
+        """Angular rate of the camera, rad/s, and the vehicle's velocity, m/s (0 if unknown), world
+        axes (3,) each, at an offset within `REACH_S`; beyond it, at the window's end.
+        """
         n = 3
         middle = round((offset_s + REACH_S) / _STEP_S)
         middle = min(max(middle, n), len(OFFSETS_S) - 1 - n)
@@ -88,8 +90,10 @@ def autopilot_window_at(
     return AutopilotWindow(np.array(camera), np.array(body), np.array(place))
 
 
-def at(values: Array, offset_s: float) -> Array:
-    """Values (K, T, ...) of K timestamps at one offset, linearly interpolated: (K, ...)."""
+def at_offset(values: Array, offset_s: float) -> Array:
+    """Values (K, T, ...) of K timestamps at one offset, linearly interpolated: (K, ...). Beyond
+    `REACH_S`, those of the window's end.
+    """
     where = np.clip((offset_s + REACH_S) / _STEP_S, 0.0, len(OFFSETS_S) - 1.001)
     i = int(where)
     t = where - i

@@ -35,7 +35,7 @@ class BoardPage:
 
     @classmethod
     def of(cls, paper: Paper) -> BoardPage:
-        """The largest board that leaves a printer's margins."""
+        """The page of that paper with the largest board that leaves a printer's margins."""
         return cls(*_SHEETS_MM[paper])
 
 
@@ -52,8 +52,8 @@ def board_picture(dots: int = _DOTS_PER_SQUARE) -> Image:
 
 
 def write_sheet(path: Path, paper: Paper) -> BoardPage:
-    """Write the board as PDF or PNG, by the file's suffix; `ReportError` for others.
-
+    """Write the board as PDF or PNG, by the file's suffix, and return its measures. `ReportError`
+    for another suffix, or if it cannot be written.
     Printed at 100 %, the squares have the size stated on the sheet.
     """
     sheet = BoardPage.of(paper)

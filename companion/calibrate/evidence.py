@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.autopilot_window import AutopilotWindow, at
+from companion.calibrate.autopilot_window import AutopilotWindow, at_offset
 from companion.calibrate.pictures import Parts
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
@@ -95,7 +95,7 @@ class CalibrationProblem:
         """The deployment's camera model with these corrections (COUNT,)."""
         return changed_camera(self._camera, shared)
 
-    def pixels(self, guess: Guess) -> Array:
+    def pixel_residuals(self, guess: Guess) -> Array:
         """(N, 2): predicted minus measured, weighted by each patch's information, px."""
         away = self._points - guess.places[self.owner]
         x, y, z = np.einsum("nji,nj->in", guess.rotations[self.owner], away)
@@ -105,21 +105,21 @@ class CalibrationProblem:
         weighted: Array = np.einsum("nij,nj->ni", self._root, off)
         return weighted
 
-    def attitudes(self, guess: Guess) -> Array:
+    def attitude_residuals(self, guess: Guess) -> Array:
         """(K, 3): estimated against reported, rotation vectors in the camera's axes, rad."""
         late_s = float(guess.shared[u.LATE])
         heading = so3_exp([0.0, 0.0, -guess.shared[u.HEADING]])  # clockwise from north, in ENU
         mount = self._mount @ so3_exp(guess.shared[u.MOUNT]) @ GIMBAL_FROM_CAMERA
-        window = heading @ at(self._housing, -late_s) @ mount
+        window = heading @ at_offset(self._housing, -late_s) @ mount
         off = np.swapaxes(window, 1, 2) @ guess.rotations
         turned: Array = Rotation.from_matrix(off).as_rotvec()
         return turned
 
-    def places(self, guess: Guess) -> Array:
+    def place_residuals(self, guess: Guess) -> Array:
         """(K, 3): estimated minus reported position, metres; NaN where none was reported."""
         late_s, s = float(guess.shared[u.LATE]), guess.shared
-        place = at(self._place, -late_s)
-        arm = at(self._body, -late_s) @ (self.arm_m + s[u.ARM])
+        place = at_offset(self._place, -late_s)
+        arm = at_offset(self._body, -late_s) @ (self.arm_m + s[u.ARM])
         climbed = (place[:, 2] - self._ground_m) * s[u.CLIMB]
         window = place + arm + s[u.SHIFT]
         window[:, 2] += climbed
@@ -128,7 +128,7 @@ class CalibrationProblem:
 
 
 def changed_camera(camera: Camera, shared: Array) -> Camera:
-    """A camera model with estimated corrections added."""
+    """A copy of a camera model with the estimated corrections `shared` (COUNT,), see `UNKNOWNS`."""
     scale = float(np.exp(shared[u.FOCAL]))
     right, down = shared[u.CENTRE]
     bent = np.array(camera.distortion)

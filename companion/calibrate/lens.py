@@ -32,7 +32,9 @@ class LensEstimate:
 
 
 def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstimate:
-    """Estimate the camera from views (Zhang 2000). `RecordError` with fewer than eight views."""
+    """Estimate the camera from views (Zhang 2000), without those whose error is three times the
+    median. width, height: of their images, px. `RecordError` with fewer than eight views.
+    """
     if len(views) < _LEAST_VIEWS:
         raise RecordError(
             f"{len(views)} usable views of the board; the camera's model needs {_LEAST_VIEWS}, "

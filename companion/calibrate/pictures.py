@@ -57,8 +57,8 @@ class PictureReader:
         self._undistorter = Undistorter(camera, self._working)
 
     def read(self, frame: Frame, pose: Pose, sweep: Sweep | None) -> Parts | None:
-        """The patches of an image taken at `pose`, with rolling shutter `sweep`; None
-        if unusable.
+        """The patches of an image taken at `pose`, with rolling shutter `sweep` (None: global).
+        None if the map or the image shows too little.
         """
         view = self._renderer.render(pose, self._working, wait=True)
         if np.count_nonzero(view.depth) < 0.2 * view.depth.size:

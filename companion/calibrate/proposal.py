@@ -39,8 +39,8 @@ class SettingChange:
 
 
 def setting_changes(config: CompanionConfig, found: CalibrationResult) -> tuple[SettingChange, ...]:
-    """All settings that the flight's estimate replaces. They were estimated together and must be
-    replaced together.
+    """All settings of the flown deployment `config` whose value the flight's estimate changes. They
+    were estimated together and must be replaced together.
     """
     s, told = found.shared, config.camera.model
     camera = changed_camera(found.camera, s)
@@ -103,7 +103,9 @@ def _sigmas(config: CompanionConfig, found: CalibrationResult) -> list[SettingCh
 
 
 def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[SettingChange, ...]:
-    """The settings that a board calibration changes. config: None if there is no deployment yet."""
+    """All settings that a board calibration gives, changed or not. config: None if there is no
+    deployment yet; `before` is then None.
+    """
     model = None if config is None else config.camera.model
     told = None if config is None else config.localizer.calibration
     c = lens.camera
@@ -171,8 +173,10 @@ def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
 
 
 def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -> Path:
-    """Replace the deployment file; returns the name of the old file, kept beside it. Access rights
-    stay the same. `ConfigError` if the result is not valid or cannot be written.
+    """Write the changes into the deployment file, with `camera.calibrated` of today; its comments
+    are lost. Returns the path of the old file, kept beside it. Access rights stay the same.
+    heading: comment for the first line. `ConfigError` if the result is not valid or cannot be
+    written.
     """
     document = with_current_keys(CompanionConfig, read_settings(path, ConfigError), str(path))
     _apply(document, wanted)
@@ -194,8 +198,8 @@ def write_changed(path: Path, wanted: tuple[SettingChange, ...], heading: str) -
 
 
 def blind_spots(found: CalibrationResult) -> tuple[str, ...]:
-    """Combinations of values that this flight cannot separate, in words: weak eigenvectors of its
-    information.
+    """Combinations of values that this flight cannot separate, in words, worst first: weak
+    eigenvectors of its information. () if it separates all.
     """
     D = np.diag(u.USEFUL)
     information = D @ found.solution.information @ D

@@ -93,17 +93,17 @@ def solve(
 
 
 def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise:
-    off = evidence.pixels(guess)
+    off = evidence.pixel_residuals(guess)
     squares = (off**2).sum(axis=1)
     sigma = float(np.sqrt(np.median(squares) / (2.0 * np.log(2.0))))
     weight = 1.0 / (1.0 + squares / (_CAUCHY * sigma) ** 2)
     attitude = AttitudeProcess.of(
-        evidence.attitudes(guess), guess.rotations[:, 2], evidence.times_s,
+        evidence.attitude_residuals(guess), guess.rotations[:, 2], evidence.times_s,
         _LEAST["attitudes"], _WHITE["attitudes"],
     )  # fmt: skip
     place, placed = before.place, evidence.placed
     if placed.any():
-        left = evidence.places(guess)[placed]
+        left = evidence.place_residuals(guess)[placed]
         place = GaussMarkovProcess.of(left, evidence.times_s[placed], _LEAST["places"])
     return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
 
@@ -113,7 +113,7 @@ def _with_long_term_errors(evidence: CalibrationProblem, guess: Guess, noise: _N
     placed = evidence.placed
     if not placed.any():
         return noise
-    left = evidence.places(guess)[placed]
+    left = evidence.place_residuals(guess)[placed]
     return replace(noise, place=noise.place.over_long_steps(left, evidence.times_s[placed]))
 
 
@@ -127,9 +127,9 @@ def _normal(
     M = u.COUNT + 6 * K
     H, g = np.zeros((M, M)), np.zeros(M)
     _add_pictures(_pictures(evidence, guess, noise), H, g)
-    _add_wander(evidence.attitudes, "attitudes", noise.attitude, evidence, guess, H, g)
+    _add_wander(evidence.attitude_residuals, "attitudes", noise.attitude, evidence, guess, H, g)
     if evidence.placed.any():
-        _add_wander(evidence.places, "places", noise.place, evidence, guess, H, g)
+        _add_wander(evidence.place_residuals, "places", noise.place, evidence, guess, H, g)
     H[range(u.COUNT), range(u.COUNT)] += prior
     g[: u.COUNT] += prior * guess.shared
     H[range(u.COUNT, M), range(u.COUNT, M)] += 1e-9
@@ -160,7 +160,7 @@ def _derivatives(
 
 def _pictures(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> ImageNormalEquations:
     optics = range(*u.OPTICS.indices(u.COUNT))
-    value, by_frame, by_shared = _derivatives(evidence.pixels, guess, optics)
+    value, by_frame, by_shared = _derivatives(evidence.pixel_residuals, guess, optics)
     weight = noise.weight / (noise.pixel_sigma**2 * _ALIKE)
     by_optics = by_shared[..., u.OPTICS]
     return ImageNormalEquations.of(evidence.owner, weight, value, by_frame, by_optics)

@@ -49,7 +49,9 @@ class BoardViews:
         self.views: list[BoardView] = []
 
     def add_image(self, image: Image) -> str:
-        """Add an image (H, W, 3); returns the result in words for the user."""
+        """Add the next image (H, W, 3); returns the result in words for the user, "taken" if its
+        view is kept. The board must stand still since the image before.
+        """
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         corners, names, _, _ = self._detector.detectBoard(grey)
         if names is None or len(names) < _LEAST_CORNERS:

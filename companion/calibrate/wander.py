@@ -50,7 +50,7 @@ class GaussMarkovProcess:
     def of(cls, left: Array, times_s: Array, least: float) -> GaussMarkovProcess:
         """Estimate from residuals (K, 3) minus their mean, by restricted likelihood (Patterson
         and Thompson 1971); of equally likely correlation times it takes the longest. A shorter one
-        would make the sigmas too small.
+        would make the sigmas too small. least: of the sigmas.
         """
         sigmas, memories = np.zeros(3), np.zeros(3)
         gaps, free_of_mean = np.diff(times_s), len(times_s) - 1
@@ -130,7 +130,7 @@ class AttitudeProcess:
     ) -> AttitudeProcess:
         """Estimate from residuals (K, 3) of a solution with mounting and heading, by restricted
         likelihood as `GaussMarkovProcess.of`. If a flight cannot separate vertical and boresight,
-        each gets half of the error.
+        each gets half of the error. up: (K, 3), as stored; white: sigma of uncorrelated noise.
         """
         few = np.unique(np.linspace(0, len(times_s) - 1, min(_FEW, len(times_s))).round())
         k = few.astype(int)

@@ -32,8 +32,9 @@ def watch_board(
 ) -> BoardViewing:
     """Collect views of the board until all are there, the source ends, or `seconds` have passed.
 
-    source: as `open_source`. on_view: called after each change with the views, the result of the
-    newest image and the missing views. keep: folder for the images used, None for none.
+    source: as `open_source`. on_view: called after each change, and after each 30 images without
+    one, with the number of views, the result of the newest image and the missing views. keep:
+    folder for the images used, which is created; None for none. `StreamError` if the source fails.
     """
     size = read_stream_size(source)
     views = BoardViews(size.width, size.height)

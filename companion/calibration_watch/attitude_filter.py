@@ -41,22 +41,27 @@ class AttitudeFilter:
 
     @property
     def boresight_rad(self) -> tuple[CalibrationEstimate, CalibrationEstimate, CalibrationEstimate]:
-        """Boresight error in yaw (about the vertical), pitch and roll."""
+        """Boresight error in yaw (about the vertical), pitch and roll: how vision's attitude is
+        turned against that of gimbal and autopilot, about `level_axes`.
+        """
         return self._figure(0), self._figure(1), self._figure(2)
 
     @property
     def late_s(self) -> CalibrationEstimate:
-        """Delay of the frames' timestamps, s."""
+        """Delay of the frames' timestamps, s; positive: they are later than the exposures."""
         return self._figure(_LATE)
 
-    def forget_stamps(self) -> None:
+    def forget_time_offset(self) -> None:
         """Reset the time offset to unknown."""
         self._forget([_LATE])
 
     def add(
         self, seen: CalibrationObservation, known: AutopilotObservation, seconds: float
     ) -> None:
-        """Add an observation and the autopilot's data, `seconds` after the one before."""
+        """Add a registered frame (`seen`), `seconds` after the one before, and the autopilot's data
+        at its time (`known`). Without its attitude or turn rate nothing is learned. Four outliers
+        in a row reset the angles, or in a turn the time offset.
+        """
         self._cov = self._cov + np.diag(np.square(_WALKS) * min(seconds, 10.0))
         if known.ned_from_camera is None or known.turn is None:
             return
@@ -93,7 +98,9 @@ class AttitudeFilter:
 
 
 def level_axes(ned_from_camera: Array) -> Array:
-    """Axes of a camera, made level, as rows in NED: down (yaw), right (pitch), forward (roll)."""
+    """Axes (3, 3) of a camera, made level, as rows in NED: down (yaw), right (pitch), forward
+    (roll). Forward is where it looks; if it looks nearly down or up, where the image's top is.
+    """
     forward = ned_from_camera[:, 2] * np.array([1.0, 1.0, 0.0])
     if np.linalg.norm(forward) < _LEVEL_TURN:
         forward = -ned_from_camera[:, 1] * np.array([1.0, 1.0, 0.0])

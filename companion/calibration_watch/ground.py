@@ -28,11 +28,12 @@ class GroundView:
         self._newest: CalibrationObservation | None = None
 
     def add(self, observation: CalibrationObservation) -> None:
-        """Add a registered frame that was accepted against the map."""
+        """Set the newest registered frame that was accepted against the map."""
         self._newest = observation
 
     def height_m(self, state: VehicleState, now_ns: int) -> float | None:
-        """Height above the ground, the largest of the known ones (m); None if none is known.
+        """Height above the ground, m: the larger of that above take-off (`state`) and that by the
+        newest registered frame; None if neither is known.
 
         now_ns: time of the query; observations from long before it are not used.
         """
@@ -43,7 +44,7 @@ class GroundView:
         return max(known, default=None)
 
     def width_m(self, state: VehicleState, now_ns: int) -> float:
-        """Width of the ground in the frame at now_ns, m."""
+        """Width of the ground in the frame at now_ns, m; with unknown height as from 100 m."""
         newest = self._newest
         if newest is not None and now_ns - newest.time_ns < _HOLDS_NS:
             return newest.depth_m * _width_ratio(newest.horizontal_fov_deg)

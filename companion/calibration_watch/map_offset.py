@@ -49,7 +49,7 @@ class MapOffsetTelemetry(Protocol):
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time; None unless the EKF uses GNSS."""
+        """As of `VehicleTelemetry`: the EKF's position at a time; None unless it uses GNSS."""
         ...
 
     def report_alert(self, alert: Alert) -> None:
@@ -76,8 +76,7 @@ class MapOffset:
 
 
 def estimate(blocks: Array, bias_m: float) -> MapOffset:
-    """Estimate the offset from blocks (N, 2) of median differences, north and east, metres.
-
+    """Estimate the offset from blocks (N, 2): median differences vision - GNSS, north and east, m.
     Blocks more than three robust sigmas from the median are left out. bias_m: sigma of GNSS's own
     error, per axis; averaging does not reduce it.
     """
@@ -128,7 +127,7 @@ class MapOffsetEstimator:
             return self._shift
 
     def report(self) -> dict[str, float | bool] | None:
-        """Figures for the health report; None before there are any."""
+        """Estimate and applied offset for the health report; None before there is an estimate."""
         with self._lock:
             shift, applied = self._shift, self._applied.copy()
         if shift is None:
@@ -144,7 +143,9 @@ class MapOffsetEstimator:
         }
 
     def check(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
-        """Add a fix, to be compared with GNSS; return it, shifted if the policy is "apply"."""
+        """Add a fix, to be compared with GNSS 0.7 s later (only while TRACKING); return it, shifted
+        if the policy is "apply" and the offset significant. seen: its estimate.
+        """
         if seen.state is TrackingState.TRACKING and not self._gnss_is_ours:
             self._waiting.append(fix)
         while self._waiting and fix.time_ns - self._waiting[0].time_ns >= _WAITS_NS:

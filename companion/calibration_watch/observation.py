@@ -51,9 +51,9 @@ class CalibrationEstimate:
     sigma: float
 
     def exceeds(self, limit: float) -> bool:
-        """Whether the value is above the limit and differs from zero by four sigmas."""
+        """Whether the value's size is above the limit and above four sigmas."""
         return abs(self.value) > limit and abs(self.value) > 4.0 * self.sigma
 
     def is_within(self, limit: float) -> bool:
-        """Whether the value plus two sigmas is below the limit."""
+        """Whether the value's size plus two sigmas is below the limit."""
         return abs(self.value) + 2.0 * self.sigma < limit

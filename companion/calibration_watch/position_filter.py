@@ -57,15 +57,15 @@ class PositionFilter:
 
     @property
     def late_s(self) -> CalibrationEstimate:
-        """Delay of the frames' timestamps, s."""
+        """Delay of the frames' timestamps, s; positive: they are later than the exposures."""
         return self._figure(_T)
 
     def forget_motion(self) -> None:
-        """Forget the motion since the last observation, after a gap or a jump of vision."""
+        """Reset position, velocity and IMU bias to unknown, after a gap or a jump of vision."""
         for at in (_P, _V, _A):
             self._loosen(at, 2)
 
-    def forget_stamps(self) -> None:
+    def forget_time_offset(self) -> None:
         """Reset the time offset to unknown."""
         self._loosen(_T, 1)
 
@@ -96,9 +96,10 @@ class PositionFilter:
         known: AutopilotObservation,
         climb_mps: float,
     ) -> None:
-        """Correct the state, predicted to the observation's time, by one observation.
-
-        place: (2,) of the vehicle by vision, north and east, m from a fixed point; climb_mps: up.
+        """Correct the state, predicted to the observation's time, by one observation (`seen`) and
+        the autopilot's data at its time (`known`).
+        place: `seen.place` as north and east (2,), m from a point that stays the same; climb_mps:
+        the vehicle's, up positive.
         """
         axis = seen.ned_from_camera[:, 2]
         behind = seen.depth_m * axis  # by which a share of 1 would put the camera back

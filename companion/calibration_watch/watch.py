@@ -79,7 +79,7 @@ class CalibrationWatch:
         self._doubted_ns: int | None = None
 
     def add(self, observation: CalibrationObservation) -> None:
-        """Add a registered frame that was accepted against the map."""
+        """Queue a registered frame that was accepted against the map, for `step`."""
         if self._limits.enabled:
             self._waiting.append(observation)
 
@@ -98,11 +98,15 @@ class CalibrationWatch:
         self._last, self._last_ns = None, since_ns
 
     def suspect_timestamps(self, since_ns: int) -> None:
-        """Discard the estimated time offset: timestamps may have changed at since_ns."""
+        """Discard the estimated time offset: timestamps may have changed at since_ns. It is unknown
+        until frames from then on are processed.
+        """
         self._doubted_ns = since_ns
 
     def step(self, now_ns: int, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
-        """Process the new observations; called a few times a second."""
+        """Process the observations that are 0.7 s old, when the autopilot's data of their time is
+        there; called a few times a second. track: already integrated (`InertialTrack.follow`).
+        """
         if not self._limits.enabled:
             return
         state = vehicle.state()
@@ -116,7 +120,7 @@ class CalibrationWatch:
                 self._take(seen, state, vehicle, track)
 
     def figures(self) -> CalibrationFigures:
-        """The current estimates."""
+        """The current estimates; unknown ones have a large or infinite sigma."""
         angles = self._attitude.boresight_rad
         worst = max(range(3), key=lambda i: abs(angles[i].value) / max(angles[i].sigma, 1e-6))
         angle, late = angles[worst], self._lateness()
@@ -129,7 +133,9 @@ class CalibrationWatch:
         return CalibrationFigures(self._position.focal, late, boresight, AXES[worst])
 
     def position_error_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
-        """Position error caused by the estimated errors of focal length and time (if True), m."""
+        """Position error, m, caused by the estimated focal length error (if `focal`) at the newest
+        frame's depth, and by the estimated time offset (if `time`) at this speed.
+        """
         focal_m = abs(self._position.focal.value) * self._depth_m if focal else 0.0
         return focal_m + (abs(self._lateness().value) * speed_mps if time else 0.0)
 
@@ -167,8 +173,8 @@ class CalibrationWatch:
         self._depth_m = seen.depth_m
         if self._doubted_ns is not None and seen.time_ns >= self._doubted_ns:
             self._doubted_ns = None
-            self._position.forget_stamps()
-            self._attitude.forget_stamps()
+            self._position.forget_time_offset()
+            self._attitude.forget_time_offset()
         if not self._kept or seen.time_ns - self._kept[-1].time_ns >= _KEEPS_NS:
             known_now = _Known(seen.time_ns - 1, self._position, self._attitude)
             self._kept.append(copy.deepcopy(known_now))

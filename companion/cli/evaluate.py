@@ -180,7 +180,9 @@ def evaluate_command(
 def place_finder(
     stack: MapStack, config: LocalizerConfig, known: SimulatedPlaceData | None
 ) -> Iterator[PlaceFinder | None]:
-    """The search for a position without a prior; yields None if the option does not select it."""
+    """Context manager: the search for a position without a prior; None if `known`, the simulated
+    knowledge of the place, is None. Opens or computes the map's overview.
+    """
     opened = None if known is None else open_relocalizer(stack.cache, config)
     if known is None or opened is None:
         yield None
@@ -199,7 +201,7 @@ def _print_problems(frames: list[EvaluatedFrame]) -> None:
 
 
 def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
-    """Print the columns of the paper's Table 2, and how many images could not be used."""
+    """Print the columns of the paper's Table 2, with the number of unusable images."""
     caption = "medians of localized frames; recalls and completeness of all"
     m = metrics
     table = Table(title=title, caption=caption)

@@ -9,7 +9,9 @@ from companion.errors import ConfigError
 
 
 def numbers(text: str, option: str, names: Sequence[str]) -> tuple[float, ...]:
-    """Parse ``--prior 47.1,8.5,500,...``; `names`: meanings of the numbers, for the error."""
+    """Parse the text of an option, as 47.1,8.5,500; `names`: meanings of the numbers, one each.
+    `ConfigError` for another count, or what is no finite number.
+    """
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

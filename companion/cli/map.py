@@ -225,7 +225,9 @@ def info(
         result_file(geojson, "--geojson", (".geojson", ".json"))
     if kml is not None:
         result_file(kml, "--kml", (".kml",))
-    _require_place(*(file for file in (geojson, kml) if file is not None))
+    for option, file in (("--geojson", geojson), ("--kml", kml)):
+        if file is not None:
+            _require_place(option, file)
     from localizer.geometry.antimeridian import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
@@ -327,18 +329,19 @@ def render(
     if out.suffix.lower() != ".png":
         raise typer.BadParameter(f"--out {out}: give a name that ends in .png")
     depth = out.with_name(f"{out.stem}_depth{out.suffix}")
-    _require_place(out, depth)
+    _require_place("--out", out, depth)
     from localizer.geometry.camera import Camera
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection import inspect
+    from localizer.pictures import write_rgb
 
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
     with show_work(Console(stderr=True), "rendering; the first time compiles the renderer"):
         view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
     with writing(out, "--out"):
-        inspect.write_picture(out, view.rgb)
-        inspect.write_picture(depth, inspect.depth_picture(view.depth))
+        write_rgb(out, view.rgb)
+        write_rgb(depth, inspect.depth_picture(view.depth))
     shown = view.depth[view.depth > 0]
     Console().print(f"{out}, {depth}: depth {shown.min():.1f} to {shown.max():.1f} m")
 
@@ -352,7 +355,7 @@ def export(
     ] = None,
 ) -> None:
     """Write the map's surface as one GLB (y up, metres about the cache's origin)."""
-    _require_place(out)
+    _require_place("--out", out)
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import export_glb
 
@@ -380,13 +383,13 @@ def _make_overview(cache: Path) -> None:
             Console().print(f"overview: {view.area_km2:.2f} km², {view.nbytes / 1e6:.1f} MB")
 
 
-def _require_place(*files: Path) -> None:
+def _require_place(option: str, *files: Path) -> None:
     """Check that the files can be written, before the long computation."""
     for file in files:
-        refuse_input(file, "--out")
+        refuse_input(file, option)
         if file.is_dir():
-            raise typer.BadParameter(f"--out {file}: is a folder; give a file's name")
+            raise typer.BadParameter(f"{option} {file}: is a folder; give a file's name")
         if not file.parent.is_dir():
-            raise typer.BadParameter(f"--out {file}: no such folder")
+            raise typer.BadParameter(f"{option} {file}: no such folder")
         if not os.access(file if file.exists() else file.parent, os.W_OK):
-            raise typer.BadParameter(f"--out {file}: may not be written; choose another place")
+            raise typer.BadParameter(f"{option} {file}: may not be written; choose another place")

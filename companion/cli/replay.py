@@ -69,7 +69,9 @@ def _spread(values: Array, digits: int) -> tuple[str, ...]:
 
 
 def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
-    """Serve the page with the record on this machine; records beside it can be downloaded."""
+    """Serve the page with the record until interrupted; records beside it can be downloaded.
+    map_cache: None for the record's own map; listen: address:port.
+    """
     require_extra()
     from companion.console.records import Records
     from companion.console.replay_source import ReplaySource

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
 from companion.redaction import redacted
-from companion.settings_file import nested_models, settings
+from companion.settings_file import nested_models, settable_fields
 from localizer.plain_files import plain_text
 
 _MOST_BYTES = 64 << 10
@@ -52,8 +52,8 @@ def check(path: Path, text: str) -> CompanionConfig:
 
 
 def replace(path: Path, text: str) -> Path:
-    """Write a valid text; returns the path of the old one. `ConfigError` if the text is not valid
-    or cannot be written.
+    """Write a valid text into the existing deployment file; returns the path of the copy of the old
+    one, NAME.TIME.old. `ConfigError` if the text is not valid or cannot be written.
     """
     check(path, text)
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
@@ -77,7 +77,7 @@ def replace(path: Path, text: str) -> Path:
 def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, str]]:
     """(key, default, description) of every setting of the model; keys begin with `where`."""
     lines = []
-    for name, field in settings(model).items():
+    for name, field in settable_fields(model).items():
         nested = nested_models(field.annotation)
         key = f"{where}{name}"
         if nested:

@@ -29,8 +29,9 @@ class Examination:
         return {"running": running, "lines": list(self._lines), "code": self._code}
 
     def begin(self, beside_flight: bool) -> bool:
-        """Start the doctor; False if it is running. beside_flight: a flight uses the vehicle and
-        the feed, which are not checked then.
+        """Start the doctor in the running event loop, for at most 180 s; False if it is running.
+        The output of the last run is forgotten. beside_flight: a flight uses the vehicle and the
+        feed, which are not checked then.
         """
         if self._task is not None and not self._task.done():
             return False

@@ -42,13 +42,15 @@ class FlightSource:
         await self._event.wait()
 
     def watch(self, wanted: bool) -> None:
-        """Request frames from the flight, or stop."""
+        """Request frames from the flight, or stop; also from the next one that connects."""
         if wanted != self._wanted:
             self._wanted = wanted
             self._send({"kind": "watch", "frames": wanted})
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """Send an order and wait for its result: whether it was executed, and a text."""
+        """Send an order and wait up to 3 s for its result: whether it was executed, and a text.
+        False without a connection or answer, though an order without answer may be executed.
+        """
         if self._connection is None:
             return False, "no flight is connected"
         number = next(self._numbers)
@@ -63,7 +65,7 @@ class FlightSource:
             self._answers.pop(number, None)
 
     async def run(self) -> None:
-        """Connect and read, again and again."""
+        """Connect and read, again and again, until cancelled."""
         while True:
             try:
                 await self._serve()

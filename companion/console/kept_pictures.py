@@ -30,7 +30,9 @@ class KeptPictures:
         self._shown: int | None = None
 
     def newest(self, now_ns: int) -> Message | None:
-        """The newest frame up to a time; None if there is none or it was already returned."""
+        """The newest frame up to a time, with the estimate of its exposure; None if there is none,
+        it was returned by the call before, or it cannot be used. Renders, which takes a while.
+        """
         camera = self._tables.camera
         known = [p for p in self._kept if p[0] <= now_ns]
         if not known or camera is None or known[-1][0] == self._shown:

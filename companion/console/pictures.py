@@ -105,7 +105,7 @@ def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]
 
 
 def reduced(picture: OverlayFrame, width_px: int) -> OverlayFrame:
-    """The frame reduced to this width, because a screen cannot show more."""
+    """The frame and its camera reduced to this width; unchanged if it is not wider."""
     camera = picture.camera
     if camera.width <= width_px:
         return picture
@@ -141,7 +141,8 @@ def edges(picture: OverlayFrame) -> np.ndarray:
 
 
 def map_at_pose(picture: OverlayFrame) -> np.ndarray | None:
-    """The map rendered as the camera saw it, with distortion, at half size; None without a pose.
+    """The map as the camera saw it, (h, w, 3) uint8 RGB with distortion, at half size; None without
+    a pose or a view of the map.
 
     The reference was rendered at the predicted pose; each pixel is moved to the estimated pose by
     its depth, in two iterations.
@@ -184,7 +185,7 @@ def _between_knots(at: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def footprint(picture: OverlayFrame) -> list[list[float]]:
-    """Corners of the ground in view, (east, north) m, without those in the sky."""
+    """Corners (east, north), m, of the ground in the view, without those in the sky; or []."""
     view = picture.view
     if view is None:
         return []

@@ -19,7 +19,9 @@ _CHUNK = 256 << 10
 
 @dataclass(frozen=True)
 class RecordFolder:
-    """One record. started_utc_ns: None if unknown; ended: how the flight ended, "" if unknown."""
+    """One record. started_utc_ns: None if unknown; ended: how the flight ended, "not ended" if it
+    has not, or was cut off.
+    """
 
     name: str
     path: Path
@@ -34,7 +36,7 @@ class Records:
         self._folder = folder
 
     def list_records(self) -> list[RecordFolder]:
-        """Every record, newest first; links are left out."""
+        """The folder's records, newest first, at most 200, without links; [] if it is missing."""
         if self._folder is None or not self._folder.is_dir():
             return []
         found = []

@@ -61,7 +61,9 @@ class ReplaySource:
         await self._event.wait()
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
-        """Execute. share: jump to this part of the flight, 0 to 1; play: continue or pause."""
+        """Jump (share: part of the flight, 0 to 1), else go on or pause (play); whether it is
+        either, and a text.
+        """
         share, play = order.get("share"), order.get("play")
         if isinstance(share, int | float) and 0 <= share <= 1:
             self._at_s = float(share) * self._length_s

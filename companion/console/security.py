@@ -53,7 +53,7 @@ _HEADERS = (
 
 
 def read_token(path: Path | None) -> str | None:
-    """The token in a file that only its owner can read; `ConfigError` otherwise."""
+    """The token in a file that only its owner can read, else `ConfigError`. None without a path."""
     if path is None:
         return None
     try:

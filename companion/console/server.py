@@ -71,7 +71,9 @@ class Pages:
         self._making = asyncio.Lock()
 
     async def serve(self, socket: WebSocket) -> None:
-        """Send the newest data to one page until it disconnects; older data are skipped."""
+        """Send the newest data to one page until it disconnects or takes none for 10 s; older data
+        are skipped. A ninth page is refused.
+        """
         await socket.accept()
         if len(self._open) >= _MOST_PAGES:
             await socket.close(1013, "too many pages are open")
@@ -209,7 +211,7 @@ class Views:
         return Response(text, media_type=kind, headers=_attachment(name))
 
     async def order(self, request: Request) -> Response:
-        """Orders that are allowed in flight: targets and position hints."""
+        """Orders that are allowed in flight, with `console.control`: targets and position hints."""
         self._require_control()
         order = await _object(request)
         if order.get("do") not in ("target", "box", "stop", "hint"):
@@ -219,7 +221,9 @@ class Views:
         return JSONResponse({"ok": ok, "text": text}, status_code=200 if ok else 409)
 
     async def examine(self, request: Request) -> Response:
-        """The doctor: POST starts it, GET returns its output so far."""
+        """The doctor: POST starts it, with `console.control` and disarmed; both return its output
+        so far.
+        """
         if self._examination is None:
             raise RefusedError("there is no deployment to examine")
         if request.method == "POST":
@@ -231,7 +235,9 @@ class Views:
         return JSONResponse(self._examination.report())
 
     async def settings(self, request: Request) -> Response:
-        """The deployment file: GET returns it, POST checks or writes it."""
+        """The deployment file: GET returns it; POST, with `console.control` and disarmed, checks
+        its "text", and writes it if "write" is true.
+        """
         path = self._site.deployment
         if path is None:
             raise RefusedError("there is no deployment to show")
@@ -261,7 +267,7 @@ class Views:
         return JSONResponse([{k: asdict(r)[k] for k in keys} for r in list_records])
 
     async def record(self, request: Request) -> Response:
-        """One record as .tar, or its report."""
+        """One record as .tar, or its report, which is made only while disarmed."""
         record = await run_in_threadpool(self._site.records.find, request.path_params["name"])
         if record is None:
             raise RefusedError("there is no record of that name")
@@ -307,7 +313,7 @@ class Views:
 
 
 def make_application(site: ConsoleSite) -> RequestGuard:
-    """The complete web application of the console."""
+    """The complete web application of the console. While it is served, it runs the source."""
     views, pages = Views(site), Pages(site.source)
 
     @contextlib.asynccontextmanager

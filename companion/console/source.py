@@ -27,7 +27,7 @@ class Newest:
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
 
     def add(self, message: Message) -> None:
-        """Store a message of the flight by its kind."""
+        """Store a message of the flight by its kind; "hello" clears samples and events."""
         kind = message.head.get("kind")
         if kind == "hello":
             self.hello = message.head
@@ -45,7 +45,7 @@ class Newest:
                 self.samples.append(sample)
 
     def is_armed(self) -> bool | None:
-        """Whether the vehicle is armed; None if unknown during a flight."""
+        """Whether the vehicle is armed; None if the flight does not hear it, False without one."""
         if self.hello is None:
             return False
         vehicle = (self.state or {}).get("vehicle") or {}

@@ -85,7 +85,7 @@ class TopTiles:
         }
 
     def tile(self, name: TileName) -> bytes | None:
-        """The tile as JPEG; None outside the map."""
+        """The tile as JPEG, rendered unless it is kept; None outside the map. Any thread."""
         if not name.is_valid:
             return None
         frame = self._cache.frame
@@ -111,7 +111,7 @@ class TopTiles:
             return self._kept[name]
 
     def close(self) -> None:
-        """End the loader."""
+        """End the loader; no tile may be asked for any more."""
         if self._streamer is not None:
             self._streamer.close()
 

@@ -89,7 +89,7 @@ def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Angles:
 
 
 def angles_of_matrix(R: Array) -> Angles:
-    """Euler angles of a rotation (3, 3). At pitch -90, where roll and yaw merge, roll is 0."""
+    """Euler angles of a rotation (3, 3). At pitch -90 or 90 roll and yaw merge: roll is 0."""
     if np.hypot(R[0, 0], R[1, 0]) < _LOCKED:
         pitch = float(np.copysign(np.pi / 2, -R[2, 0]))
         roll, yaw = 0.0, float(np.arctan2(-R[0, 1], R[1, 1]))

@@ -54,8 +54,9 @@ def read_photos(
     heights: Heights | None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[StampedPose, ...]:
-    """Poses of one photo or of a folder's photos, by name. tell: receives warnings about the tags.
-    `PoseFileError` if there is no photo.
+    """Poses of one photo or of a folder's photos and lone sidecars, by name. tell: receives
+    warnings about the tags. `PoseFileError` if there is none, one lacks position, height or angles,
+    or their heights have different datums; `GeoreferenceError` if `heights` is None.
     """
     known = _known(path, heights)
     photos = [path]
@@ -137,7 +138,10 @@ def _home_m(tags: PhotoTags) -> float:
 def write_sidecars(
     folder: Path, poses: Sequence[StampedPose], frame: LocalFrame, heights: Heights | None
 ) -> None:
-    """Write ``NAME.xmp`` with DJI's tags for each pose; photos are not changed."""
+    """Write ``NAME.xmp`` with DJI's tags for each pose into the folder, which is created; older
+    ones are replaced, photos are not changed. `GeoreferenceError` if `heights` is None; raises
+    OSError.
+    """
     lift = _known(folder, heights).lift_m
     folder.mkdir(parents=True, exist_ok=True)
     for pose in poses:

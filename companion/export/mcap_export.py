@@ -67,7 +67,8 @@ def export_mcap(
 
     out: ``record.mcap`` in the record if None; tlog: another file than the record's own; progress:
     called now and then with the number of rows written. `RecordError` for a folder that is no
-    record, `ReportError` if the file cannot be written.
+    record, `ReportError` if the file cannot be written (an existing one then stays), `ConfigError`
+    as of `require_extra`.
     """
     folder = record_folder(folder)
     tables = read_record(folder)

@@ -24,8 +24,8 @@ _PROFILE = ""  # Foxglove's schemas need none
 
 
 class McapFile:
-    """Writes rows of a flight to an MCAP file. clock_offset_ns: from CLOCK_MONOTONIC to UTC;
-    camera: of the images, None: no calibration.
+    """Writes rows of a flight to an MCAP file, which is replaced. clock_offset_ns: from
+    CLOCK_MONOTONIC to UTC; camera: of the images, None: no calibration.
     """
 
     def __init__(self, path: Path, clock_offset_ns: int, camera: Camera | None) -> None:
@@ -76,7 +76,7 @@ class McapFile:
         self._add(topic, "protobuf", self._schemas[name], message.SerializeToString(), time_ns)
 
     def attach(self, path: Path) -> None:
-        """Attach a file of the record unchanged."""
+        """Attach a JSON file of the record unchanged."""
         time_ns = path.stat().st_mtime_ns
         self._writer.add_attachment(
             time_ns, time_ns, path.name, "application/json", plain_bytes(path)

@@ -1,7 +1,8 @@
 """Converts rows of a record to messages of Foxglove's schemas (package foxglove-schemas-protobuf).
 
 A row maps column names to numbers or their text, so that recorded and live rows are processed
-alike. Frames: "map" is the map's ENU in metres; "camera" is OpenCV's: x right, y down, z forward.
+alike. time_ns: UTC. Frames: "map" is the map's ENU in metres; "camera" is OpenCV's (x right, y
+down, z forward).
 Heights are above the WGS84 ellipsoid.
 """
 

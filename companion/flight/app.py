@@ -61,7 +61,9 @@ class Companion:
         self._is_up = False
 
     def prepare(self) -> None:
-        """Build what takes long and needs neither link nor camera; called by a standby."""
+        """Build what takes long and needs neither link nor camera, for a later `run`; called by a
+        standby. On an error, what was built is closed; `run` then builds everything.
+        """
         try:
             self._parts.make(self._up, ahead=True)
         except BaseException:
@@ -69,7 +71,7 @@ class Companion:
             raise
 
     def discard_prepared(self) -> None:
-        """Close the components that `prepare` built, because they are not used."""
+        """Close and forget the components that `prepare` built."""
         self._up.close()
         self._parts.forget()
 
@@ -78,7 +80,7 @@ class Companion:
 
         Raises the error that ended the video, after the shutdown. If the start fails, all
         components that were started are stopped, because a remaining thread would keep the process
-        alive.
+        alive; if building fails, the empty record is removed too.
         """
         sys.setswitchinterval(_SWITCH_S)
         self._parts.channels.events.subscribe(_log_event)
@@ -130,16 +132,15 @@ class Companion:
         return feed
 
     def stop(self) -> bool:
-        """End `run` soon, with a clean shutdown.
-
-        Returns False during the start, which continues. For a signal handler: it takes no lock,
-        because the interrupted code may hold it.
+        """Make `run` end soon, with a clean shutdown; returns at once.
+        Returns False while `run` still builds: it ends only after that. For a signal handler: it
+        takes no lock, because the interrupted code may hold it.
         """
         self._is_stopping = True
         return self._is_up
 
     def discard_record(self) -> None:
-        """Remove the record of a failed start; may be called at any of its steps."""
+        """Remove a failed start's record, if it has no row; at any time, also repeatedly."""
         for undo in self._parts.abandonments:
             undo()
 

@@ -26,7 +26,9 @@ class CalibrationObserver:
         self._next_ns = 0
 
     def add_fix(self, estimate: PoseEstimate, bundle: ReferenceBundle, fix: VisionFix) -> None:
-        """Pass on a registration against the map (`bundle`), while TRACKING. Never blocks."""
+        """Pass on a registration against the map, at most one in 0.25 s; ignored unless TRACKING
+        and with the map in the middle of `bundle`'s view. Never blocks. fix: of this estimate.
+        """
         time_ns = estimate.exposure_time_ns
         if estimate.state is not TrackingState.TRACKING or time_ns < self._next_ns:
             return
@@ -50,7 +52,9 @@ class CalibrationObserver:
 
 
 def middle_depth_m(depth: Float32) -> float | None:
-    """Median over the middle half of a view's depth (H, W), metres; None without a map there."""
+    """Median over the middle half of a view's depth (H, W), metres, 0 where no map is; None if the
+    map covers a quarter of it or less.
+    """
     h, w = depth.shape
     middle = depth[h // 4 : 3 * h // 4 : _EVERY, w // 4 : 3 * w // 4 : _EVERY]
     seen = middle[middle > 0.0]

@@ -63,17 +63,19 @@ class BuildContext:
         return self._assembly[kind]
 
     def get(self, kind: type[T]) -> T | None:
-        """The component of that class; None in a deployment without it."""
+        """As `[]`, but None in a deployment without that component."""
         self._require_named(kind, self._part.depends)
         return self._assembly.get(kind)
 
     def later(self, kind: type[T]) -> Callable[[], T]:
-        """A function that returns a component which is built later; call it after the start."""
+        """A function that returns a component which is built later; call it once all are built.
+        LookupError if the row's `later` does not name it.
+        """
         self._require_named(kind, self._part.later)
         return lambda: self._assembly[kind]
 
     def on_failed_start(self, undo: Callable[[], None]) -> None:
-        """Call `undo` if this start fails. A signal handler may call it at any time from now on."""
+        """Call `undo` if this start fails: perhaps repeatedly, and from a signal handler."""
         self._assembly.abandonments.append(undo)
 
     def _require_named(self, kind: type, named: tuple[type, ...]) -> None:
@@ -124,7 +126,9 @@ class Assembly:
                 up.callback(part.close, made)
 
     def hand_over(self) -> None:
-        """A restart follows the coming stop, which is not clean: keep state for the restart."""
+        """Tell all built components that a restart follows the coming stop, which is not clean:
+        they keep their state for it. Call before the stop.
+        """
         for part in self._parts:
             if part.hand_over is not None and part.kind in self._made:
                 part.hand_over(self._made[part.kind])
@@ -134,7 +138,7 @@ class Assembly:
         self._made.clear()
 
     def start(self, up: ExitStack) -> None:
-        """Start every component; `up` stops them in reverse."""
+        """Start every component, after `make`; `up` stops them in reverse."""
         for part in self._parts:
             made = self._made[part.kind]
             if part.start is not None:

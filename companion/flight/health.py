@@ -135,7 +135,9 @@ class HealthMonitor:
             self._file.stop()
 
     def end(self, how: str) -> None:
-        """Set the reason for which the flight ends; the last report states it."""
+        """Set the reason for which the flight ends. From now on nothing is reported until `stop`,
+        whose last report states it.
+        """
         self._ended = how
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
@@ -272,7 +274,7 @@ class HealthMonitor:
             "rate_hz": self._rate(),
             "stages_ms": _stages([e for _, e in list(self._estimates)]),
             "bridge": self._bridge.counters(),
-            "shadow": {"ready": score.go, "text": score.line()},
+            "shadow": {"ready": score.ready, "text": score.line()},
             "guardian": _monitor_report(self._integrity_monitor),
             "map_shift": self._map_shift(),
             "targets": self._targets(),

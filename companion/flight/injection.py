@@ -48,7 +48,7 @@ class JumpCounter:
         self._state = TrackingState.INITIALIZING
 
     def add_state(self, state: TrackingState) -> None:
-        """Add the tracking state of the next frame."""
+        """Add the tracking state of the next frame, in order; `count` may grow."""
         before, self._state = self._state, state
         is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
         found_again = before is TrackingState.BRIDGING and state is TrackingState.TRACKING
@@ -72,9 +72,7 @@ class FixInjection:
         self._checks_failed = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
 
     def add_check(self, check: FixCheck) -> None:
-        """Add a check that is called with every fix, after the earlier ones; it may hold or change
-        the fix.
-        """
+        """Add a check, called with each fix that earlier ones pass; it may hold or change it."""
         self._checks = (*self._checks, check)
 
     def add_observer(self, observer: Observer) -> None:
@@ -82,7 +80,9 @@ class FixInjection:
         self._observers = (*self._observers, observer)
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
-        """Convert an estimate, inject the fix if all checks pass, call observers. Never blocks."""
+        """Convert an estimate, inject the fix if all checks pass, call observers. Others than
+        accepted ones, TRACKING or BRIDGING, only count as jumps. Never blocks.
+        """
         self._jumps.add_state(estimate.state)
         if not is_for_injection(estimate):
             return

@@ -16,8 +16,10 @@ import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, TypeAdapter
 
 from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
@@ -38,6 +40,7 @@ _FARTHEST_M = 1e6
 _CLOCK_NS = 500_000_000  # by which the first measurement of the autopilot's clock may be off
 _SAME_DEG, _SAME_M = 1e-6, 0.1  # of an origin that is read again
 LocalAt = Callable[[int], tuple[float, ...] | None]
+_Metres = Annotated[float, Field(gt=-_FARTHEST_M, lt=_FARTHEST_M)]
 
 
 @dataclass(frozen=True)
@@ -51,18 +54,18 @@ class LastFix:
     """
 
     boot: str
-    time_ns: int
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    sigma_m: float
-    local_ned: tuple[float, float, float]
+    time_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)]
+    height_m: _Metres
+    sigma_m: Annotated[float, Field(gt=0.0, lt=_FARTHEST_M)]
+    local_ned: tuple[_Metres, _Metres, _Metres]
     autopilot_ns: int | None = None
     origin: tuple[float, float, float] | None = None
 
     def has_same_origin(self, state: VehicleState, time_ns: int) -> bool:
-        """Whether the EKF still uses the same origin at time_ns: False after a reboot of the
-        autopilot, or if the origin was moved.
+        """Whether the EKF still uses the same origin at time_ns (CLOCK_MONOTONIC): False after a
+        reboot of the autopilot, or if the origin was moved; True if nothing tells. state: newest.
         """
         offset_ns, origin = state.clock_offset_ns, _place(state.origin)
         since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS
@@ -74,6 +77,9 @@ class LastFix:
         return all(abs(a - b) <= most for a, b, most in pairs)
 
 
+_STORED = TypeAdapter(LastFix)
+
+
 def _place(origin: Origin | None) -> tuple[float, float, float] | None:
     if origin is None:
         return None
@@ -81,7 +87,9 @@ def _place(origin: Origin | None) -> tuple[float, float, float] | None:
 
 
 def read_last_fix(path: Path, boot: str) -> LastFix | None:
-    """The position that a process of this boot wrote; None without one that can be trusted."""
+    """The position in the file, if a process of this boot (id `boot`) wrote it; None otherwise. If
+    the file is there but unreadable, implausible or writable by others, the log says so.
+    """
     try:
         status = os.lstat(path)
         if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
@@ -90,38 +98,13 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
         if status.st_uid != os.geteuid() or status.st_mode & 0o022:
             _log.warning("%s may be written by others: ignored", path)
             return None
-        row = json.loads(read_small_file(path))
-        north, east, down = (float(v) for v in row["local_ned"])
-        since, origin = row.get("autopilot_ns"), row.get("origin")
-        counted = None if origin is None else tuple(float(v) for v in origin)
-        if counted is not None and len(counted) != 3:
-            raise ValueError(f"{counted} is no origin")
-        found = LastFix(
-            str(row["boot"]), int(row["time_ns"]), float(row["latitude_deg"]),
-            float(row["longitude_deg"]), float(row["height_m"]), float(row["sigma_m"]),
-            (north, east, down), None if since is None else int(since), counted,
-        )  # fmt: skip
+        found = _STORED.validate_json(read_small_file(path))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         _log.warning("%s cannot be used: %s", path, error)
         return None
-    if not _is_place(found):
-        _log.warning("%s cannot be used: it names no place", path)
-        return None
     return found if boot and found.boot == boot else None
-
-
-def _is_place(fix: LastFix) -> bool:
-    """Whether the numbers are plausible; False for NaN."""
-    metres = (fix.height_m, *fix.local_ned)
-    return (
-        0 <= fix.time_ns < 1 << 63
-        and abs(fix.latitude_deg) <= 90.0
-        and abs(fix.longitude_deg) <= 180.0
-        and all(abs(v) < _FARTHEST_M for v in metres)
-        and 0.0 < fix.sigma_m < _FARTHEST_M
-    )
 
 
 class FixMemory:
@@ -157,11 +140,11 @@ class FixMemory:
         self._thread.start()
 
     def hand_over(self) -> None:
-        """A restart follows the coming stop: keep the file for the next process."""
+        """Make `stop` keep the file, for the process that follows."""
         self._leaves = True
 
     def stop(self) -> None:
-        """Stop. After a clean shutdown the file is removed. Does not wait for a disk that hangs."""
+        """Stop the thread; remove the file unless `hand_over` was called or the disk hangs."""
         self._stop.set()
         if wait_for_end(self._thread) and self._path is not None and not self._leaves:
             try:
@@ -170,14 +153,16 @@ class FixMemory:
                 _log.warning("the last fix is not removed: %s", error)
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Store a position that the map confirmed, to be written. Never blocks."""
+        """Take a position that the map confirmed, to be written if it is trusted then; forget the
+        previous process's. Other estimates are ignored. Never blocks.
+        """
         if estimate.accepted and estimate.state is TrackingState.TRACKING:
             self._newest, self._before = estimate, None
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """Prior for time_ns (CLOCK_MONOTONIC) by the previous process's position and the EKF's
-        displacement since; None if unknown or too old, or after this process has found a position
-        itself.
+        """Prior of the camera for time_ns (CLOCK_MONOTONIC) by the previous process's position and
+        the EKF's displacement since. None while attitude or displacement is unknown, and from then
+        on if it is too old, if the EKF jumped, or if this process has found a position itself.
         """
         last = self._before
         if last is None:

@@ -54,12 +54,14 @@ class AutopilotSource(Protocol):
         ...
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's position (north, east, down) from its origin, m; None if unknown."""
+        """The EKF's position (north, east, down) from its origin, m, at a CLOCK_MONOTONIC time;
+        None if unknown.
+        """
         ...
 
 
 def drift_sigma_m(seconds: float) -> float:
-    """Horizontal sigma of an EKF's position, m, `seconds` after its last absolute measurement."""
+    """Horizontal sigma, m (at most 5 km), that an EKF gains in `seconds` without measurements."""
     return min(SENSORS.ekf_drift.sigma_m(seconds), _LARGEST_SIGMA_M)
 
 
@@ -105,7 +107,9 @@ class PositionQualityMonitor:
             self._fix_ns = time_ns
 
     def at(self, state: VehicleState, now_ns: int, *, on_gnss: bool = True) -> PositionQuality:
-        """Quality of this state's position at now_ns. on_gnss: whether the EKF uses GNSS."""
+        """Quality of this state's position at now_ns. Healthy GNSS is noted as the last absolute
+        measurement. on_gnss: whether the EKF uses GNSS.
+        """
         healthy = on_gnss and gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
         with self._lock:
             if healthy:
@@ -156,7 +160,7 @@ class AutopilotPose:
         self.belief = PositionQualityMonitor(config)
 
     def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
-        """Note the time of an accepted estimate. Never blocks.
+        """Note the time of an accepted estimate that `reaches_ekf`. Never blocks.
 
         reaches_ekf: whether positions are sent to the EKF. A fix in shadow mode or on hold does not
         correct the EKF, which may drift; the search region must allow for that.
@@ -212,7 +216,9 @@ class AutopilotPose:
         return bool(self._autopilot.state().ekf_flags & _ATTITUDE)
 
     def prior(self, time_ns: int) -> PosePrior | None:
-        """Prior of the camera's pose at a CLOCK_MONOTONIC time; None while unknown."""
+        """Prior of the camera's pose at a CLOCK_MONOTONIC time; None if position, its sigma,
+        attitude or gimbal is unknown. Not `independent` if the EKF's position is our own fixes'.
+        """
         state = self._autopilot.state()
         belief = self._quality(state, time_ns)
         if belief.sigma_m is None:
@@ -228,8 +234,8 @@ class AutopilotPose:
         return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
-        """The camera's rotation (3, 3), map axes from camera, at that time, from attitude and
-        gimbal; None if unknown.
+        """The camera's rotation (3, 3), map axes from camera, at a CLOCK_MONOTONIC time, by the
+        reported attitude of the camera to NED; None if unknown.
         """
         gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
@@ -269,10 +275,6 @@ class PriorSources:
 
     def __init__(self, *sources: PriorProvider) -> None:
         self._sources = sources
-
-    def add(self, source: PriorProvider) -> None:
-        """Add a source, used if the earlier ones have no prior."""
-        self._sources = (*self._sources, source)
 
     def at(self, time_ns: int) -> PosePrior | None:
         """A prior for that CLOCK_MONOTONIC time; None if no source has one."""

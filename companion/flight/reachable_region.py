@@ -52,7 +52,9 @@ class ReachableRegion:
         self._seen: _ConfirmedPosition | None = None
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Store a position that the map confirmed."""
+        """Store a position that the map confirmed, with the EKF's velocity (zero if unknown); other
+        estimates are ignored.
+        """
         if not estimate.accepted or estimate.state is not TrackingState.TRACKING:
             return
         velocity = self._vehicle.state().local_velocity_ned or (0.0, 0.0, 0.0)
@@ -67,7 +69,9 @@ class ReachableRegion:
             self._follow()
 
     def region(self, time_ns: int) -> SearchRegion | None:
-        """Region of the camera at a CLOCK_MONOTONIC time, map axes; None before the first fix."""
+        """Region of the camera at a CLOCK_MONOTONIC time, map axes; None before the newest
+        confirmed position, or without one.
+        """
         with self._lock:
             self._follow()
             seen, end, run = self._seen, self._track.at(self._track.newest_ns), self._track.restarts

@@ -55,7 +55,7 @@ EVENT_COLUMNS = ("time_ns", "level", "text", "alert")
 
 def fresh_folder(folder: Path) -> Path:
     """`folder`, or a numbered one beside it if it already holds a record, so that a restart in
-    flight does not overwrite the record.
+    flight does not overwrite the record. Creates nothing.
     """
     candidate, number = folder, 2
     while (candidate / "estimates.csv").exists():
@@ -65,9 +65,8 @@ def fresh_folder(folder: Path) -> Path:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove the record of a failed start, whose files hold at most column names.
-
-    Any of the files may be missing.
+    """Remove the record of a failed start, whose files hold at most column names. Any of the files
+    may be missing. Does nothing if a row was written or the disk fails; keeps other files.
     """
     tables = [folder / name for name in ("estimates.csv", "targets.csv", "events.csv")]
     snapshots = folder / "snapshots"
@@ -82,8 +81,8 @@ def remove_empty(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, config: CompanionConfig) -> None:
-    """Write ``record.json``: settings, the map's hash, versions, and one time on both clocks.
-
+    """Write ``record.json`` into an existing folder: settings without credentials, the map's hash,
+    versions, and one time on both clocks.
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
     `ReportError` if it cannot be written, `DiskFaultError` if the disk is the cause.
     """
@@ -152,7 +151,8 @@ def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
 
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder, and the accepted
-    estimates as a trajectory (`TrajectoryFiles`, created with the first of them).
+    estimates as a trajectory (`TrajectoryFiles`, created with the first of them). The constructor
+    creates folder and files, replacing older ones (`ReportError`), and starts the thread.
 
     No method blocks its caller: rows beyond a bounded queue are dropped and counted. If the disk is
     full or gone, rows are dropped and counted too, and the flight continues without its record.
@@ -206,7 +206,7 @@ class Recorder:
         self._put("targets", lambda: _target_row(fix, self._frame))
 
     def event(self, level: str, text: str, alert: str = "") -> None:
-        """Record an event at the current time. alert: its identifier, if any."""
+        """Record an event at the current time. level: info or warning; alert: identifier or ""."""
         row = (time.monotonic_ns(), level, text, alert)
         self._put("events", lambda: row)
 
@@ -224,7 +224,7 @@ class Recorder:
                 self._written(frame)
 
     def close(self) -> bool:
-        """Write the queue and close the files. False if the disk hangs, which is not waited for."""
+        """Write the queue and close the files. False if the disk hangs for 10 s."""
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)
@@ -323,7 +323,9 @@ class RecordKeeper:
     def open(
         self, config: CompanionConfig, record: RecordConfig, claim: Callable[[Path], None]
     ) -> None:
-        """Create a record in its own folder. claim: called with the folder before it is created."""
+        """Create a record in its own folder. claim: called with the folder before it is created. If
+        the disk is full or failing, the record is marked incomplete; otherwise `ReportError`.
+        """
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
@@ -337,7 +339,9 @@ class RecordKeeper:
             raise
 
     def link(self) -> None:
-        """Point the link ``latest`` beside the record to it, unless a record has that name."""
+        """Point the link ``latest`` beside the open record to it, unless a record has that name. A
+        failure is only logged.
+        """
         if self.folder is None or self.folder.name.startswith(LATEST_NAME):
             return
         link = self.folder.parent / LATEST_NAME
@@ -352,7 +356,9 @@ class RecordKeeper:
             _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
-        """Write the queue, close the files, and write map files (KML etc.) of the targets."""
+        """Write the queue, close the files, and write map files (KML etc.) of the targets; nothing
+        if no record is open.
+        """
         answers = self.recorder is None or self.recorder.close()
         if self.folder is not None and answers:
             try:

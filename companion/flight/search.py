@@ -80,9 +80,8 @@ class RelocalizationHypothesis:
     def predicted_query(
         self, query: PlaceQuery, velocity: Array | None, reachable: SearchRegion | None
     ) -> PlaceQuery | None:
-        """`query`, of a later frame, limited to where the camera can be by then; None after more
-        than 10 s.
-
+        """`query`, of a later frame, limited to where the camera can be by then, with its attitude
+        and height corrected by what was found; None unless it is up to 10 s later.
         velocity: (3,) m/s in the map's axes, of the EKF, None if unknown; reachable: the reachable
         region at the time of the later frame.
         """
@@ -113,7 +112,7 @@ class RelocalizationHypothesis:
         )
 
     def velocity_to(self, later: Relocalization) -> Array | None:
-        """Mean velocity (3,), m/s, from this position to a later one; None below 0.3 s."""
+        """Mean velocity (3,), m/s, map axes, to a position at least 0.3 s later; otherwise None."""
         elapsed_s = self._elapsed_s(later.exposure_time_ns)
         if elapsed_s < _LEAST_BASE_S:
             return None
@@ -145,7 +144,9 @@ def _speed_sigma(velocity: Array | None) -> float:
 def enu_on_map(
     cache: TileCache, latitude_deg: float, longitude_deg: float, radius_m: float
 ) -> tuple[float, float] | None:
-    """East and north of a position, metres; None if it is more than radius_m from the map's box."""
+    """East and north of a WGS84 position in the map's frame, metres; None if it is more than
+    radius_m from the map's box in either.
+    """
     place = cache.frame.enu_from_geodetic(
         latitude_deg, longitude_deg, cache.manifest.origin.height_m
     )
@@ -187,17 +188,17 @@ class PlaceSearch:
         self._thread = threading.Thread(target=self.prepare, name="overview", daemon=True)
 
     def start(self) -> None:
-        """Start the thread that prepares the search."""
+        """Start the thread that runs `prepare`."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Cancel the preparation, if it still runs."""
+        """Cancel the preparation, if it still runs; wait for that up to 10 s."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(_STOP_S)
 
     def close(self) -> None:
-        """Release the renderer and its loader. No search may run."""
+        """Stop, and release renderer and loader; no search may run, later ones return None."""
         self.stop()
         if self._open is not None:
             self._open.close()
@@ -210,7 +211,9 @@ class PlaceSearch:
         self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
 
     def hint_at(self, hint: PlaceHint) -> bool:
-        """As `hint`, for a position in WGS84 and twice its radius; False if it is off the map."""
+        """As `hint`, for a position in WGS84 and twice its radius, and log it. False and nothing
+        set if it is off the map.
+        """
         radius_m = _HINT_SIGMAS * hint.radius_m
         at = enu_on_map(self._cache, hint.latitude_deg, hint.longitude_deg, radius_m)
         if at is None:
@@ -220,8 +223,10 @@ class PlaceSearch:
         return True
 
     def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
-        """The camera's pose at the frame's exposure, as a hypothesis. None if there is no clear
-        result, or if the search took so long that the next call must search again near it.
+        """The camera's pose at the frame's exposure, as a hypothesis; takes seconds. None until the
+        map's overview is open, without the autopilot's attitude or height, without a clear result,
+        and if the search took so long that the next call must search again near it.
+        should_stop: asked during the search, which ends without a result once it is true.
         """
         if self._open is None:
             return None
@@ -270,7 +275,7 @@ class PlaceSearch:
 
     def region(self, time_ns: int) -> SearchRegion | None:
         """Search region: the operator's position, else that of the autopilot, else the reachable
-        region. None: the whole map, which every fifth search without autopilot's position covers.
+        region. None: the whole map, in every fifth call that has to use the reachable region.
         """
         hint = self._hint
         if hint is not None and time.monotonic() - hint.time_s < _HINT_S:
@@ -283,7 +288,9 @@ class PlaceSearch:
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 
     def prepare(self) -> None:
-        """Open the map's overview on this thread; set `lacks` and report if that fails."""
+        """Open or compute the map's overview in the caller's thread, for `search`. `lacks` is then
+        None, or says why no search is possible, which is reported too. Raises nothing.
+        """
         # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)

@@ -21,9 +21,8 @@ def released_companion(
     restart: bool = False,
     lost_settings: str = "",
 ) -> Companion | None:
-    """Return the flight process: at once, or for a standby when the supervisor releases it. None if
-    it never does.
-
+    """The flight process, not yet running. A standby is prepared here and returned when a line
+    comes on standard input, from the supervisor; None if the input ends without one.
     pulse, restart, lost_settings: see `Companion`. For a standby, restart is always true.
     """
     companion = Companion(

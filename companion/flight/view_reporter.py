@@ -49,7 +49,7 @@ class ViewReporter:
         wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Add an estimate; only accepted ones are reported. Never blocks."""
+        """Set the estimate to report next; ignored unless accepted. Never blocks."""
         if estimate.accepted:
             self._newest = estimate
             self._came.set()

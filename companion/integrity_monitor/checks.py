@@ -155,7 +155,9 @@ class IntegrityChecks:
     # --- evidence -----------------------------------------------------------------------------
 
     def add_frame(self, time_ns: int, image: Image) -> None:
-        """Add a frame (H, W, 3) uint8 at its exposure time (ns), for the video checks."""
+        """Add a frame (H, W, 3) uint8 at its exposure time (ns), for the video checks. One that is
+        not later than the last counts only as a fault of the timestamps.
+        """
         if self._picture is not None and time_ns <= self._picture[0]:
             self._backwards += 1
             return
@@ -176,7 +178,7 @@ class IntegrityChecks:
         held: bool = False,
     ) -> VisionFix | None:
         """Return a fix, with protection level and covariance completed, if it may be injected; None
-        holds it.
+        holds it. Call it once for each fix, in time order: it is evidence for `step`, too.
 
         Its reset count is increased if earlier fixes were wrong. A fix of the odometry that only
         its protection level holds is marked `position_withheld`; each fix of the odometry gets the

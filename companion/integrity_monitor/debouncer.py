@@ -67,11 +67,11 @@ class AlertDebouncer:
         return self.alert() if self.raised else cleared(self.spec.id)
 
     def restore(self, figure: float, word: CalibrationError) -> None:
-        """Activate the alert as before a restart; evidence clears it as usual."""
+        """Activate the alert as before a restart, without a report; evidence clears it as usual."""
         self.raised, self.figure, self.word = True, figure, word
 
     def alert(self) -> Alert:
-        """The active alert with its newest values."""
+        """The alert with its newest values, whether active or not."""
         values = (self.figure,) if self.word is None else (self.figure, self.word)
         return Alert(self.spec.id, values[: len(self.spec.values)])
 
@@ -107,7 +107,7 @@ class InhibitMemory:
         return found
 
     def store(self, found: ActiveAlerts) -> None:
-        """Store the alerts that are active now, if they changed; without any, delete the memory."""
+        """Store the active alerts, if others than at the last call; with none, drop the memory."""
         if found.keys() == self._kept:
             return
         self._kept = frozenset(found)

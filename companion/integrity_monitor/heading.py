@@ -35,7 +35,9 @@ class HeadingChange:
 
 
 def heading_change(fix: VisionFix, attitude: Attitude | None) -> HeadingChange | None:
-    """The heading differences of a fix; None if one of the headings is unknown."""
+    """The heading differences of a fix; None if one of the headings is unknown. attitude: the
+    autopilot's at the fix's time.
+    """
     yaw_rad = fix.yaw_rad
     if attitude is None or yaw_rad is None:
         return None
@@ -59,7 +61,8 @@ class HeadingHistory:
             self._turns.append(turn)
 
     def rotation_from_median(self, turn: HeadingChange) -> float:
-        """Rotation of a fix from the median of the history, rad; 0 with too few headings.
+        """Size of a fix's rotation from the median of the newest second, rad; 0 with too few
+        headings.
 
         The gyros' heading has errors after lost ATTITUDE messages, and the autopilot's may step; a
         rotation counts only if both show it.

@@ -80,23 +80,23 @@ class IntegrityMonitor:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread; a thread that hangs is not waited for."""
+        """Stop the thread; one that hangs is waited for up to 2 s."""
         self._stop.set()
         self._thread.join(2.0 * _LOCK_S)
 
     def close(self) -> None:
-        """Clean shutdown: delete what is stored for a restart."""
+        """Delete what is stored for a restart, unless `hand_over` was called."""
         if self._memory is not None:
             self._memory.stop()
 
     def hand_over(self) -> None:
-        """A restart follows the coming stop: keep the stored inhibitions for it."""
+        """Keep the stored inhibitions, for the process that follows; call it before `close`."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=False)
 
     def watch(self, last_ticks_ns: Callable[[], Mapping[str, int]]) -> None:
-        """Report components that stall for 4 s. last_ticks_ns: gives the time of each component's
-        last run, CLOCK_MONOTONIC ns.
+        """From now on report components that stall for 4 s. last_ticks_ns: called in each run;
+        gives the time of each component's last run, CLOCK_MONOTONIC ns.
         """
         self._last_ticks = last_ticks_ns
 
@@ -111,7 +111,9 @@ class IntegrityMonitor:
                 self._monitor.add_observation(observation)
 
     def check(self, fix: VisionFix) -> VisionFix | None:
-        """The fix as it may be injected (see `IntegrityChecks.admit`); None holds it."""
+        """The fix as it may be injected (see `IntegrityChecks.admit`); None holds it, also if a
+        check fails or the monitor's thread hangs. Waits up to 1 s for the lock; raises nothing.
+        """
         try:
             if self._is_stalled():
                 return None
@@ -178,7 +180,9 @@ class IntegrityMonitor:
             self.run_checks()
 
     def run_checks(self) -> None:
-        """Run all checks once; the thread calls it ten times a second."""
+        """Run all checks once, report their alerts, and set or clear inhibitions at the bridge. The
+        thread calls it ten times a second.
+        """
         self.last_tick_ns = self._clock()
         self._note_success("taking turns")
         picture, self._picture = self._picture, None

@@ -141,7 +141,8 @@ class JumpCheck:
         *,
         agrees: bool,
     ) -> bool:
-        """Whether the fix may pass; called once for each fix. attitude: the autopilot's at the
+        """Whether the fix may pass; called once for each fix, in time order. Sets `step`,
+        `announced`, `jumped` and, of a held fix, `distance_m`. attitude: the autopilot's at the
         fix's time; agrees: vision moves as the IMU does, or this is unknown.
         """
         self._reckoning.add(state)

@@ -153,7 +153,9 @@ class StillPosition:
         self._reference: tuple[int, Array] | None = None
 
     def add(self, time_ns: int, here: Array) -> float:
-        """Add a position (2,), metres; returns for how many seconds it has not moved."""
+        """Add a position (2,), m from a point that stays the same; returns for how many seconds it
+        has not moved, 0 during the first.
+        """
         if not self._block:
             self._block_ns = time_ns
         self._block.append(here)

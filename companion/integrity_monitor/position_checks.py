@@ -30,12 +30,12 @@ class LocalPlace:
         self._anchor: tuple[float, float] | None = None
 
     def ned(self, fix: VisionFix) -> tuple[float, float, float]:
-        """North and east of the first fix, and down from the ellipsoid, metres."""
+        """The fix's position: north and east from the first one's, down from the ellipsoid, m."""
         north, east = self.north_east(fix.latitude_deg, fix.longitude_deg)
         return north, east, -fix.height_m
 
     def north_east(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """North and east of the first position, metres; the first call sets it."""
+        """North and east from the first position, m; the first call (also of `ned`) sets it."""
         if self._anchor is None:
             self._anchor = (latitude_deg, longitude_deg)
         return north_east(*self._anchor, latitude_deg, longitude_deg)
@@ -54,7 +54,9 @@ class HeightCheck:
         self._differences: deque[float] = deque(maxlen=_MEDIAN_OF)
 
     def add(self, fix: VisionFix, state: VehicleState) -> CheckResult:
-        """Add a fix and the state of about its time. Figure: difference of the heights, m."""
+        """Add a fix and the state of about its time. Figure: difference of the heights, m. Disarmed
+        it is good and forgets the common value, which takes 15 fixes to find.
+        """
         if not state.armed:
             self._zero = None
             self._differences.clear()
@@ -90,7 +92,9 @@ class GnssCheck:
     def read(
         self, fix: VisionFix, state: VehicleState, protection_m: float, now_ns: int
     ) -> CheckResult:
-        """Compare the newest fix with GNSS. Figure: distance, m. protection_m: the fix's level."""
+        """Compare the newest fix with GNSS. Figure: distance, m. No evidence unless GNSS is healthy
+        and its position within 0.5 s of the fix. protection_m: the fix's horizontal level.
+        """
         latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
         if latitude is None or longitude is None or not gnss_healthy(state, now_ns):
             return CheckResult(None)

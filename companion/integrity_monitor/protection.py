@@ -29,8 +29,9 @@ def protection_level(
     known_m: float,
     height_m: float | None,
 ) -> ProtectionLevel:
-    """The protection level of a fix. state: gives the velocity. known_m: estimated position error,
-    added to the bound; height_m: above the ground, None where unknown.
+    """The protection level of a fix. state: gives the velocity; without one that of the fix, or 15
+    m/s and 3 m/s up, are taken. known_m: estimated position error, added to the bound; height_m:
+    above the ground, None (taken as 120 m) where unknown.
     """
     velocity = state.local_velocity_ned or fix.velocity_ned
     speeds = _UNKNOWN_MPS

@@ -49,7 +49,7 @@ class ScaleCheck:
         self._restarts = 0
 
     def add(self, fix: VisionFix, *, jumped: bool) -> None:
-        """Add a fix that the IMU's record reaches, or a late one. jumped: restart at this fix."""
+        """Add a fix; one without odometry, IMU record or after a jump restarts the comparison."""
         moved = self._track.at(fix.time_ns)
         if jumped or moved is None or not fix.by_odometry or self._restarts != self._track.restarts:
             self._restarts = self._track.restarts
@@ -85,7 +85,7 @@ class ScaleCheck:
 
     @property
     def scale_error(self) -> float:
-        """Relative scale error of the odometry (0.1: 10 %) if it exceeds 4 sigma, otherwise 0.0."""
+        """Size of odometry's relative scale error (0.1: 10 %) if above 4 sigma, otherwise 0.0."""
         if not self._bends:
             return 0.0
         felt = np.concatenate([one.felt for one in self._bends])

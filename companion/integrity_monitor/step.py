@@ -186,7 +186,7 @@ class StepUncertainty:
         self._set(0.0, self._across_m)
 
     def confirm_position(self) -> None:
-        """Clear the steps across: the position was searched and confirmed."""
+        """Clear steps across, and one that has not lasted: a search confirmed the position."""
         self._finder.forget()
         self._set(self._along_m, 0.0)
 

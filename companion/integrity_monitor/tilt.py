@@ -39,12 +39,13 @@ class TiltCheck:
 
     @property
     def off_deg(self) -> float:
-        """Tilt difference between vision and autopilot of the newest fix, degrees."""
+        """Tilt between vision and autopilot, degrees, of the newest fix with both attitudes."""
         return math.degrees(self._off_rad)
 
     def metres(self, height_m: float | None) -> float:
         """Position error from the tilt, m: tilt times height above the ground; 0 below 2 sigma of
-        the tilt, all of it above 3 sigma. height_m: None for the largest error.
+        the tilt, all of it above 3 sigma. At most a jump (`unreported_jump_m`), as for unknown
+        height (None).
         """
         believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
         shift_m = self._most_m if height_m is None else height_m * self._off_rad

@@ -96,8 +96,8 @@ _LONGEST_TEXT = 127
 def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
     """Encode one packet: universal label, length, time, the fields by tag, checksum.
 
-    time_us: microseconds since 1970-01-01. fields: values by tag in ST 0601's units. ValueError for
-    a tag that is not known here.
+    time_us: microseconds since 1970-01-01. fields: values by tag in ST 0601's units; one out of its
+    tag's range is left out. ValueError for a tag that is not known here.
     """
     body = _item(TIME, time_us.to_bytes(8, "big"))
     for tag, value in sorted({**fields, LOCAL_SET_VERSION: VERSION}.items()):
@@ -112,7 +112,8 @@ def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
 def decode(packet: bytes) -> dict[int, float | str | int]:
     """Decode a packet to values by tag, `TIME` in microseconds; unknown tags are left out.
 
-    ValueError for another label, a packet that is cut short, or a wrong checksum.
+    ValueError for another label, a packet that is cut short, or a wrong checksum; a packet without
+    a checksum is read.
     """
     if packet[:16] != UNIVERSAL_LABEL:
         raise ValueError("not a local set of ST 0601")

@@ -32,7 +32,7 @@ class KlvContext:
     source: str = "EO"
 
 
-def picture_fields(
+def frame_fields(
     estimate: PoseEstimate,
     scene: KlvContext,
     ned_from_body: Array | None = None,
@@ -41,7 +41,8 @@ def picture_fields(
     """ST 0601 fields of an accepted estimate's frame.
 
     ned_from_body: (3, 3), the aircraft's attitude. If it is None, the angles of the aircraft and of
-    the camera relative to it are left out. A centre or corner without map below it is left out.
+    the camera relative to it are left out. Without map at the image's centre, centre and corners
+    are left out; without map at one corner, all corners. target: to be described with the frame.
     """
     pose, camera = estimate.world_from_camera, estimate.camera
     position = scene.frame.position(pose.translation)

@@ -20,7 +20,7 @@ from companion.config import KlvConfig
 from companion.ending import wait_for_end
 from companion.errors import StreamError
 from companion.klv.local_set import encode
-from companion.klv.metadata import KlvContext, picture_fields
+from companion.klv.metadata import KlvContext, frame_fields
 from companion.klv.transport import TransportWriter
 from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import Array
@@ -76,14 +76,16 @@ class KlvRelay:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread and end the stream."""
+        """Stop the thread and end the stream; packets that wait are dropped."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
         wait_for_end(self._thread)
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A connection was opened: packets after it go into a new stream."""
+        """Begin a new stream for the packets after this call. If that fails, it is counted, and
+        they go on into the stream before.
+        """
         try:
             writer = TransportWriter(self._config.output, stream)
         except StreamError as error:
@@ -92,10 +94,10 @@ class KlvRelay:
         self._put(_RelayItem(time.monotonic_ns(), writer=writer))
 
     def packet(self, packet: av.Packet) -> None:
-        """Queue a packet. Never blocks."""
+        """Queue a packet; it is dropped and counted if 512 wait. Never blocks."""
         self._put(_RelayItem(time.monotonic_ns(), packet=packet))
 
-    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+    def frame_exposed(self, pts: Fraction, exposure_time_ns: int) -> None:
         """Store the exposure time of the frame with that presentation time (s). Never blocks."""
         with self._condition:
             self._exposures[pts] = exposure_time_ns
@@ -103,7 +105,7 @@ class KlvRelay:
                 self._exposures.pop(next(iter(self._exposures)))
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Store an estimate, accepted or not. Never blocks."""
+        """Store an accepted estimate's pose; another ends the wait for it. Never blocks."""
         with self._condition:
             self._newest_ns = max(self._newest_ns, estimate.exposure_time_ns)
             if estimate.accepted:
@@ -113,7 +115,7 @@ class KlvRelay:
             self._condition.notify()
 
     def add_target(self, target: TargetEstimate) -> None:
-        """Store a target's fix. Never blocks."""
+        """Store a target's fix, for the metadata of frames within 1 s of it. Never blocks."""
         with self._condition:
             self._targets[target.fix.exposure_time_ns] = target
             while len(self._targets) > _KEPT:
@@ -175,7 +177,7 @@ class KlvRelay:
 
     def _metadata(self, estimate: PoseEstimate) -> bytes:
         time_ns = estimate.exposure_time_ns
-        fields = picture_fields(
+        fields = frame_fields(
             estimate, self._scene, self._attitude(time_ns), self._target_at(time_ns)
         )
         return encode((time_ns + self._utc_ns) // 1000, fields)

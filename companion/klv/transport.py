@@ -61,7 +61,7 @@ class TransportWriter:
         self._container.mux(packet)
 
     def close(self) -> None:
-        """Write the remaining metadata and close the file."""
+        """Write the remaining metadata and close the output. Raises OSError."""
         self._flush(1 << 62)
         self._container.close()
 

@@ -47,9 +47,11 @@ class Orders:
         self._taken: deque[float] = deque(maxlen=_MOST)
 
     def execute(self, order: dict[str, Any]) -> str:
-        """Execute an order; returns a text for the page. Raises `OrderError` with the reason.
-
-        order: JSON object; its "do" is "stop", "target", "box" or "hint".
+        """Execute an order and report it; returns a text for the page. Raises `OrderError` with the
+        reason, also for more than 10 orders in 5 s.
+        order: JSON object; its "do" is "stop", "target" (with x, y), "box" (left, top, right,
+        bottom) or "hint" (latitude_deg, longitude_deg, radius_m). Pixels are shares of the image, 0
+        to 1; "exposure_ns" names their frame.
         """
         if not self._control:
             raise OrderError("the console only reads: console.control is false")

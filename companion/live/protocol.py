@@ -52,7 +52,9 @@ class MessageDecoder:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Add received bytes; yields the messages that are complete. `LinkError` for bad data."""
+        """Add received bytes; yields the messages that are complete. It is a generator: iterate it
+        to its end, or bytes are not added. `LinkError` for bad data.
+        """
         self._buffer += data
         while len(self._buffer) >= _SIZES.size:
             head, body = _SIZES.unpack_from(self._buffer)
@@ -76,7 +78,7 @@ def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
     """Path of the socket, the same in flight and console, in a folder of this user.
 
     Each deployment (map, record, address) has its own. It is short: socket addresses end at 107
-    bytes.
+    bytes. Creates the folder; `LinkError` as of `runtime_folder`.
     """
     key = f"{Path(map_path).absolute()}\0{record and Path(record).absolute()}\0{listen}"
     name = hashlib.sha256(key.encode()).hexdigest()[:16]

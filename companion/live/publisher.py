@@ -68,7 +68,8 @@ class _Console:
 
 
 class Publisher:
-    """Serves console processes at the socket `path`, in a thread of its own.
+    """Serves console processes at the socket `path`, which the constructor makes (`LinkError`), in
+    a thread of its own.
 
     shown: gives state documents and frames; orders: executes the console's orders. frames_hz: limit
     of frames per second. The flight calls only `start`, `stop` and `wake`.
@@ -107,14 +108,14 @@ class Publisher:
             self._thread.join(2.0)
 
     def close(self) -> None:
-        """Release the socket, after `stop`."""
+        """Close the socket and remove its file, after `stop`."""
         for end in (self._listening, self._woken, self._waker):
             end.close()
         with contextlib.suppress(OSError):
             self.path.unlink()
 
     def pending_bytes(self) -> list[int]:
-        """Bytes not yet sent to each console."""
+        """Bytes of the message under way to each connected console; 0 if none is."""
         return [len(c.sending) for c in tuple(self._consoles.values())]
 
     def wake(self) -> None:

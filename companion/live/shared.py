@@ -28,7 +28,9 @@ class SharedMemory:
         self._given = False
 
     def write(self, parts: Sequence[np.ndarray]) -> int:
-        """Write the arrays in order, over the last frame; returns the number of bytes."""
+        """Write the arrays in order, over the last frame; returns the number of bytes. Only while
+        `is_read`, which is then False. OSError without memory.
+        """
         at = 0
         for part in parts:
             rest = np.ascontiguousarray(part).reshape(-1).view(np.uint8).data

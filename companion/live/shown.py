@@ -106,12 +106,12 @@ class ConsoleData:
                 self._targets.popitem(last=False)
 
     def forget_target(self, name: str) -> None:
-        """Remove a target that was ended by an order. name: its target_id."""
+        """Remove a target that ended. name: its target_id."""
         with self._lock:
             self._targets.pop(name, None)
 
     def add_event(self, level: str, text: str) -> None:
-        """Add an event, such as an alert, for the page's list. level: its severity."""
+        """Add an event, such as an alert, for the page's list. level: "info" or "warning"."""
         with self._lock:
             self._count += 1
             self._events.append((self._count, time.monotonic_ns(), level, text))
@@ -158,8 +158,8 @@ class ConsoleData:
         return plain, count
 
     def take_frame(self) -> ConsoleFrame | None:
-        """The newest frame with its pose and map view; None if there is no new one. If nothing was
-        localized for 1 s, the newest frame without a pose.
+        """The newest frame with its pose and map view. None if it was taken before, or has waited
+        longer than 60 ms. If nothing was localized for 1 s, the newest frame without a pose.
         """
         with self._lock:
             paired, self._paired = self._paired, None

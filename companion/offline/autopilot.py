@@ -13,7 +13,10 @@ from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
 class RecordedAutopilot(VehicleTracker):
-    """The vehicle's telemetry from a record's messages, replayed to any later time."""
+    """The vehicle's telemetry from a record's messages, replayed to any later time: call `advance`
+    before each look. start_ns: messages before it, CLOCK_MONOTONIC, are left out. `TlogError` if
+    the log cannot be read.
+    """
 
     def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
         c = bridge.camera

@@ -33,13 +33,15 @@ class Sigmas:
     height_m: float | None = None
 
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
-        """The localizer's settings with the sigmas of these sensors."""
+        """A copy of the localizer's settings with the sigmas of these sensors."""
         known = None if self.attitude_deg is None else AttitudePrior.with_sigma(self.attitude_deg)
         return config.model_copy(update={"attitude": known, "height_sigma_m": self.height_m})
 
 
 def sensors_of(poses: Mapping[int, Pose]) -> AuxiliarySensors:
-    """Attitude and height of poses as simulated sensor measurements. Keys: image time, ns."""
+    """Attitude and height of poses as simulated sensor measurements; None at other times. Keys:
+    image time, ns.
+    """
 
     def rotation_at(time_ns: int) -> Array | None:
         return poses[time_ns].rotation if time_ns in poses else None
@@ -60,7 +62,9 @@ class LocalizedImage:
 
 
 def image_times(images: Sequence[Path], rate_hz: float) -> tuple[int, ...]:
-    """Exposure times in ns, from ``timestamps.txt`` beside the images, else at `rate_hz`."""
+    """Exposure times in ns of images (at least one) in one folder, from its ``timestamps.txt``,
+    else at `rate_hz`. `StreamOpenError` if the file lacks one.
+    """
     times = exposure_times_of(images[0].parent, images)
     return times or tuple(round((k + 1) * 1e9 / rate_hz) for k in range(len(images)))
 

@@ -70,14 +70,14 @@ class RecordTables:
 
     @property
     def start_ns(self) -> int:
-        """Start of the record, CLOCK_MONOTONIC."""
+        """Start of the record, CLOCK_MONOTONIC ns; else the first estimate's exposure, else 0."""
         return self._time_ns("monotonic_ns") or int(
             next(iter(self.estimates.get("exposure_time_ns", ())), 0)
         )
 
     @property
     def utc_ns(self) -> int:
-        """UTC of the start; 0 if unknown."""
+        """UTC of `start_ns`, ns; 0 if unknown."""
         return self._time_ns("utc_ns")
 
     @property
@@ -121,8 +121,8 @@ class RecordTables:
 
     @property
     def tlog(self) -> Path | None:
-        """Path of the flight's .tlog: as in the settings, otherwise in the record or beside it;
-        None without one.
+        """Path of the flight's .tlog: as in the settings, otherwise in the record or beside it; as
+        in the settings, too, if it is nowhere. None if flown without one.
         """
         named = self._setting("bridge", "tlog")
         if not isinstance(named, str):
@@ -191,7 +191,9 @@ class FlightRecord:
 
 
 def read_record(folder: Path) -> RecordTables:
-    """Read the record of `companion run`; `RecordError` for another folder."""
+    """Read the record of `companion run`; `RecordError` for another folder. A flight without an
+    estimate has {} as `estimates`.
+    """
     try:
         estimates = _table(folder / "estimates.csv", ("state", "status"))
         targets = _table(folder / "targets.csv", ("target_id", "visibility"))

@@ -64,8 +64,9 @@ class ReplaySummary:
 def replay(
     record: FlightRecord, progress: Callable[[], None] = lambda: None
 ) -> list[ReplayedFrame]:
-    """Localize the recorded frames again, over the map and with the settings of the record.
-    `RecordError` if too few images can be read.
+    """Localize the recorded frames again, over the map and with the settings of the record; frames
+    without an image are left out. progress: called before each frame.
+    `RecordError` if too few images can be read, or the map's origin is not the flight's.
     """
     config = record.config
     autopilot = RecordedAutopilot(config.bridge, record.log, record.tables.start_ns)

@@ -28,7 +28,7 @@ from companion.inertial import InertialTrack
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.recorded.autopilot_log import vehicle_messages
 from companion.recorded.flight import RecordedFlight
-from companion.recorded.log_messages import Dated, autopilot, origin_message
+from companion.recorded.log_messages import Dated, origin_message, sent_by_autopilot
 from companion.sources import VideoFileSource
 from localizer.errors import MapLoadingError, OutsideMapError
 from localizer.geometry.camera import Camera
@@ -104,7 +104,8 @@ def shadow_check(
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> ShadowCheck:
     """Play the flight through the components. footage: what `flight` was read from; rate_hz: of the
-    images, at most. `RecordError` if the footage has no log or no times.
+    images, at most; progress: called with (done, all) seconds. `RecordError` if the footage has no
+    log or no times.
     """
     if flight.log is None:
         raise RecordError(f"{footage}: no log of an autopilot lies beside it; give it as LOG")
@@ -184,7 +185,7 @@ class _Messages:
             f"{path.name} does not tell the EKF's origin: "
             + ("by its positions" if local is not None else "its first position stands for it"),
         )
-        return next(autopilot(0, origin_message(at, place.alt * 1e-3 + down)))[1]
+        return next(sent_by_autopilot(0, origin_message(at, place.alt * 1e-3 + down)))[1]
 
 
 def _frames(
@@ -326,7 +327,7 @@ class _Player:
     def _score(self) -> None:
         score = self.bridge.shadow_score()
         self._scores.append(score)
-        if score.go:
+        if score.ready:
             self._counts.go_s += _SCORE_NS * 1e-9
             if self._counts.first_go_s is None:
                 self._counts.first_go_s = self._since_s()

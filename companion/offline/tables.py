@@ -17,11 +17,11 @@ Columns = Mapping[str, np.ndarray]
 
 
 def read_columns(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Columns of a CSV file as float64 arrays, NaN where a field is empty.
+    """Columns of a CSV file as float64 arrays, NaN where a field is empty; {} without a row.
 
     Columns named in `text` are strings; columns whose name ends in ``_ns`` are int64, because
     float64 would round them. A last row that a power loss cut short is left out. `RecordError` if
-    the file is not a table of a record.
+    the file is not a table of a record; OSError or UnicodeDecodeError if it cannot be read.
     """
     lines = io.StringIO(plain_text(path, None), newline="").readlines()
     if lines and not lines[-1].endswith("\n"):

@@ -50,8 +50,8 @@ class LegProposal:
 def leg_proposals(
     surveyor: Surveyor, verdicts: Sequence[LegVerdict], fixed: bool, progress: Progress | None
 ) -> tuple[LegProposal, ...]:
-    """Find the alternative with the lowest risk for each of the longest failing legs, if it is
-    better. fixed: the camera turns only with the vehicle.
+    """Find the alternative with the lowest risk for each of the twelve longest failing legs, if it
+    is better than the plan. fixed: the camera turns only with the vehicle.
     """
     bad = sorted(
         (v for v in verdicts if not v.holds), key=lambda v: -(1 - v.share) * v.leg.length_m

@@ -33,7 +33,9 @@ class Course:
         return float(self._steps().sum())
 
     def at(self, share: float) -> tuple[Array, float]:
-        """Position (3,) and heading (degrees) after a share (0 to 1) of the length."""
+        """Position (3,), world metres, and direction of the path, degrees clockwise from the map's
+        north, after a share (0 to 1) of the length.
+        """
         steps = self._steps()
         done = np.concatenate([[0.0], np.cumsum(steps)])
         way = share * done[-1]
@@ -58,7 +60,7 @@ def straight(start: Array, end: Array) -> Course:
 def spline(
     start: Array, end: Array, arrives: Array, after: Array | None, *, curved_on: bool
 ) -> Course:
-    """A spline between two positions (3,). arrives: (3,) end direction of the previous course;
+    """A spline between two positions (3,), world metres. arrives: `leaves` of the course before;
     after: next position, None for a stop; curved_on: whether the next leg is a spline.
     """
     leaves = np.zeros(3)
@@ -79,7 +81,7 @@ def spline(
 
 def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
     """One circle about a position (3,), from the point where a vehicle flying in direction
-    `arrives` (3,) meets it.
+    `arrives` (3,) meets it; counter-clockwise if the circle's radius is negative.
     """
     begin = np.arctan2(-arrives[1], -arrives[0])
     turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)

@@ -41,7 +41,8 @@ class FlownLeg:
 def flown_legs(
     verdicts: Sequence[LegVerdict], places: Array, accepted: np.ndarray
 ) -> tuple[FlownLeg, ...]:
-    """Compare each leg's samples with the frames of the flight within half a step horizontally.
+    """Compare each leg's samples with the frames of the flight within half a step horizontally; a
+    sample without such a frame was not flown.
     places: (F, 3) positions of all frames; accepted: (F,), whether each was localized.
     """
     legs = []

@@ -32,7 +32,7 @@ _Items = list[MissionItem | UnreadItem]
 
 
 def read_mission(path: Path) -> PlannedMission:
-    """Read a mission of either format; `MissionFileError` for an invalid file."""
+    """Read a mission of either format; `MissionFileError` for an invalid one, or no waypoint."""
     try:
         text = plain_text(path, _MOST_BYTES)
         read = _plan if text.lstrip()[:1] in ("{", "[") else _waypoints

@@ -44,7 +44,7 @@ class MapSquare:
         return np.stack([flat[:, 0], self.rgb.shape[0] - flat[:, 1]], axis=1)
 
 
-def sheet_of(plan: MissionForecast, cache: TileCache) -> MapSquare:
+def render_map_square(plan: MissionForecast, cache: TileCache) -> MapSquare:
     """Render the map in a square around the plan's path, north up."""
     places = _places(_all(plan))
     low, high = places.min(axis=0), places.max(axis=0)

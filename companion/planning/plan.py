@@ -83,7 +83,10 @@ def make_plan(
     question: Question,
     progress: Progress | None = None,
 ) -> MissionForecast:
-    """Forecast every leg, find the stretches that need odometry, and search alternatives."""
+    """Forecast every leg, find the stretches that need odometry, and search alternatives; takes
+    minutes on all processors. progress: called with (done, all) samples, once for the legs and once
+    for the alternatives. `MissionFileError` as of `legs_of`.
+    """
     aim = aim_of(deployment, question.pitch_deg)
     ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)

@@ -76,7 +76,7 @@ class LegVerdict:
 
     @property
     def worst(self) -> SampleVerdict:
-        """The sample with the largest risk."""
+        """The sample with the largest risk, of those that fail if there are any."""
         return max(self.samples, key=lambda j: (not j.holds, j.forecast.risk))
 
     @property

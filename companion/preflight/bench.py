@@ -48,7 +48,9 @@ def bench(
     path: Path, start: Pose, camera: Camera, config: LocalizerConfig,
     rates_hz: Sequence[int] = RATES_HZ, seconds: float = _SECONDS,
 ) -> Iterator[BenchRow]:  # fmt: skip
-    """Yield a row for each rate, in real time: a flight at 10 m/s over the map from `start`."""
+    """Yield a row for each rate, in real time: a flight at 10 m/s northwards over the map at `path`
+    from `start`. Sets the interpreter's switch interval as in flight, and leaves it so.
+    """
     sys.setswitchinterval(_SWITCH_S)
     for rate_hz in rates_hz:
         poses = [

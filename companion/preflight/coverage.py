@@ -53,7 +53,9 @@ def _path_points(points: Array) -> Array:
 
 
 def check_mission(cache: TileCache, waypoints: Sequence[MissionWaypoint]) -> DoctorFinding:
-    """Advice if the mission leaves the map, where vision ends."""
+    """A finding on the mission: advice if its places or straight ways leave the map, where vision
+    ends; good if they do not, or if it is empty.
+    """
     if not [w for w in waypoints if w.number > 0]:
         return DoctorFinding(_NAME, "none in the vehicle", _NEEDED, "nothing to check", True, False)
     points = _enu(cache.frame, waypoints)
@@ -79,7 +81,9 @@ def _number_list(numbers: Sequence[int]) -> str:
 
 
 def check_origin(origin: OriginConfig, cache: TileCache) -> DoctorFinding:
-    """Check that the configured EKF origin is on the map; the vehicle accepts no second one."""
+    """A finding, good if the configured EKF origin is within 50 km and 300 m of height of the map;
+    the vehicle accepts no second one.
+    """
     m = cache.manifest
     ground = origin.altitude_amsl_m + m.geoid_separation_m
     away_km = _away_km(cache, origin.latitude_deg, origin.longitude_deg)

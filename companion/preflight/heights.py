@@ -19,8 +19,8 @@ _ABOVE_M = 100.0  # the highest roof or tree that a ray from above should meet
 
 
 def check_heights(cache: TileCache, state: VehicleState) -> list[DoctorFinding]:
-    """Check the geoid separation, if the receiver reports both heights, and the ground height below
-    the vehicle, if it is on the map.
+    """Findings, good or not, on the geoid separation, if the receiver reports both heights, and on
+    the ground height below the vehicle, if it is disarmed on the map; [] without a GNSS fix.
     """
     if state.gps_fix_type < _FIX_3D:
         return []

@@ -21,7 +21,7 @@ def check_plausibility(config: CompanionConfig) -> list[DoctorFinding]:
 
 
 def check_ports(config: CompanionConfig) -> list[DoctorFinding]:
-    """Findings for ports that another program uses."""
+    """A finding if another program uses the port `targets.detections`; otherwise []."""
     address = config.targets.detections
     if address is None:
         return []

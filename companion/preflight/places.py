@@ -12,7 +12,7 @@ from mavlink_bridge.preflight.doctor import DoctorFinding
 
 
 def check_places(config: CompanionConfig) -> list[DoctorFinding]:
-    """Findings for record folders and signing keys with which a flight would not start."""
+    """Findings for folders, keys and console files with which a flight would not start."""
     bridge = config.bridge
     written = {"bridge.tlog": bridge.tlog}
     faults = []

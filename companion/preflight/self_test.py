@@ -64,8 +64,8 @@ def self_test(
     *,
     timed: Callable[[BenchRow], None] | None = None,
 ) -> SelfTestReport:
-    """Build a map in `folder`, track frames over it and find one without a prior.
-
+    """Build a map in `folder` (as `generate_map`), track frames over it and find one without a
+    prior. timed: receives the rows of `bench`, None: no bench.
     Raises SelfTestError if a result is off by more than 0.5 m, or if none is accepted.
     """
     config = config or LocalizerConfig()
@@ -91,7 +91,9 @@ def self_test(
 
 
 def generate_map(folder: Path) -> TileCache:
-    """Build a map without repetition, from a DSM and an orthophoto as a user brings them."""
+    """Build a map without repetition, from a DSM and an orthophoto as a user brings them. Writes
+    ``dsm.tif``, ``ortho.tif`` and ``map/`` into an existing folder.
+    """
     n = round(_SIDE_M / _CELL_M)
     rng = np.random.default_rng(0)
     colours = [_blotches(rng, n, px) for px in (3, 8, 20, 60)]

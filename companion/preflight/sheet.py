@@ -54,7 +54,9 @@ class PreflightSheet:
 def make_sheet(
     path: Path, config: CompanionConfig, diagnosis: Diagnosis, plan: Path | None, now: datetime
 ) -> PreflightSheet:
-    """Collect the sheet's contents. plan: ``plan.json`` of `companion plan`."""
+    """Collect the sheet's contents. path: of the deployment file `config`; plan: ``plan.json`` of
+    `companion plan`, None: no forecast, which counts as not good. `ReportError` for another file.
+    """
     rows = (
         _parameters(diagnosis),
         _calibration(config, now.date()),
@@ -178,7 +180,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def write_sheet(sheet: PreflightSheet, path: Path) -> tuple[Path, Path]:
-    """Write the sheet as HTML, with a text file beside it; returns both paths."""
+    """Write the sheet as HTML, with a text file of the same name (.txt) beside it; returns both
+    paths. `ReportError` if that fails.
+    """
     text_path = path.with_suffix(".txt")
     with writing(path, "--page"):
         path.write_text(as_html(sheet), encoding="utf-8")

@@ -49,13 +49,13 @@ def camera_of_tags(tags: PhotoTags) -> CameraGuess:
 
 
 def camera_given(camera: Camera, source: str) -> CameraGuess:
-    """A camera model that the user gives. source: its origin, for the report."""
+    """A camera model that the user gives, focal sigma 3 %. source: its origin, for the report."""
     return CameraGuess(camera, _GIVEN, source)
 
 
 def camera_of_file(path: Path) -> CameraGuess:
     """Read a camera model from a file. A distortion that folds the image corners, and is otherwise
-    smaller than the focal length's sigma, is dropped as overfitted.
+    smaller than the focal length's sigma, is dropped as overfitted. `CameraError` for others.
     """
     try:
         return camera_given(Camera.from_json(path), path.name)

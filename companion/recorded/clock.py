@@ -84,7 +84,10 @@ class _Pair:
 def find_offset(
     frames: Sequence[RecordedFrame], camera: Camera, track: Track, reach_s: tuple[float, float]
 ) -> ClockOffset | None:
-    """Estimate the offset within reach_s (least, greatest), s; None with too few images."""
+    """Estimate the offset within reach_s (least, greatest), s, from pairs of the frames' images;
+    takes seconds. None with too few images of features, or if the track does not cover them. Only a
+    result that `is_decisive` is to be used.
+    """
     pairs = _pairs(frames, camera)
     if len(pairs) < 2:
         return None

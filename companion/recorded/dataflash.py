@@ -17,7 +17,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.errors import FootageError
 from companion.recorded.log_messages import (
     Dated,
-    autopilot,
     gimbal_message,
     imu_message,
     origin_message,
@@ -25,6 +24,7 @@ from companion.recorded.log_messages import (
     pressure_message,
     range_message,
     receiver_message,
+    sent_by_autopilot,
 )
 
 _HEAD = b"\xa3\x95"  # of every message
@@ -56,10 +56,10 @@ def dataflash_messages(path: Path) -> Iterator[Dated]:
         ms = int(row.TimeUS) // 1000
         if time_ns - log.heartbeat_ns >= _SECOND_NS:
             log.heartbeat_ns = time_ns
-            yield from autopilot(time_ns, log.heartbeat())
+            yield from sent_by_autopilot(time_ns, log.heartbeat())
         message = _ROWS[row.get_type()](log, row, ms)
         if message is not None:
-            yield from autopilot(time_ns, message)
+            yield from sent_by_autopilot(time_ns, message)
 
 
 @dataclass

@@ -77,7 +77,9 @@ class RecordedView:
         *,
         measured: bool = True,
     ) -> RecordedView:
-        """From a gimbal's angles relative to north and the horizon; see the module."""
+        """From a gimbal's angles relative to north and the horizon, as Rz(yaw) Ry(pitch) Rx(roll);
+        pitch -90 looks down.
+        """
         angles = (float(a) for a in np.radians([roll_deg, pitch_deg, yaw_deg]))
         attitude = np.asarray(matrix_from_euler(*angles) @ GIMBAL_FROM_CAMERA)
         return cls(attitude, tilt_sigma_deg, heading_sigma_deg, measured)
@@ -161,7 +163,7 @@ class RecordedFlight:
     log: LogBeside | None = None
 
     @property
-    def located(self) -> int:
+    def located_count(self) -> int:
         """Number of frames with a recorded position."""
         return sum(frame.telemetry.position is not None for frame in self.frames)
 
@@ -184,7 +186,9 @@ class Track:
         return self._times
 
     def at(self, time_ns: int) -> Telemetry | None:
-        """Telemetry at a time (ns), interpolated; None outside the record and in gaps."""
+        """Telemetry at a time (ns), interpolated; None in gaps and outside the samples, except
+        within a tenth of `gap_s`, where the nearest one is returned.
+        """
         if not len(self._times):
             return None
         after = int(np.searchsorted(self._times, time_ns))

@@ -76,8 +76,8 @@ class FootageOptions:
 def read_footage(
     path: Path, options: FootageOptions, progress: Progress = lambda _done, _total: None
 ) -> RecordedFlight:
-    """Read photos or a video with all telemetry in them or beside them.
-
+    """Read photos or a video with all telemetry in them or beside them. A video's frames are
+    written to ``options.work/frames``. progress: called with (done, all) images.
     `FootageError` says what is missing and which option gives it.
     """
     if not path.exists():

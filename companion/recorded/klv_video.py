@@ -66,7 +66,7 @@ def read_klv_packets(path: Path) -> list[tuple[int, bytes]]:
 
 
 def read_klv(path: Path) -> KlvTrack:
-    """Telemetry of a video's KLV packets; no samples if it has none."""
+    """Telemetry of a video's KLV packets (`read_klv_packets`); no samples if it has none."""
     samples, damaged, packets, fov = [], 0, 0, None
     for time_ns, body in read_klv_packets(path):
         if body[:4] != tag.UNIVERSAL_LABEL[:4]:
@@ -91,7 +91,9 @@ def decode(packet: bytes) -> Fields:
 
 
 def telemetry(fields: Fields, time_ns: int) -> Telemetry:
-    """Position and camera direction of a packet's fields, at time_ns."""
+    """Position and camera direction of a packet's fields (`decode`), at time_ns; None for what they
+    lack.
+    """
 
     def number(name: int) -> float | None:
         value = fields.get(name)

@@ -1,4 +1,4 @@
-"""Makes MAVLink messages from log rows, as the vehicle would have sent them."""
+"""Makes MAVLink messages from log rows, as the vehicle would have sent them. ms, us: since boot."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Dated = tuple[int, Any]
 """UTC in ns (since boot, where the log knows no UTC), and a MAVLink message."""
 
 
-def autopilot(time_ns: int, message: Any) -> Iterator[Dated]:
-    """Yield the message as of the autopilot 1/1 at time_ns; nothing if its values do not fit."""
+def sent_by_autopilot(time_ns: int, message: Any) -> Iterator[Dated]:
+    """Yield the message as sent by 1/1 at time_ns; nothing if its values do not fit the fields."""
     try:
         message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
     except (struct.error, OverflowError, ValueError):
@@ -36,7 +36,7 @@ def receiver_message(
     us: int, fix: int, at_deg: tuple[float, float], amsl_m: float, satellites: int,
     accuracy_m: float,
 ) -> Any:  # fmt: skip
-    """GPS_RAW_INT. accuracy_m: horizontal; 0 if unknown."""
+    """GPS_RAW_INT. fix: GPS_FIX_TYPE; accuracy_m: horizontal, 0 if unknown."""
     latitude, longitude = (round(x * 1e7) for x in at_deg)
     return mavlink.MAVLink_gps_raw_int_message(
         us, min(fix, 8), latitude, longitude, round(amsl_m * 1e3), 65535, 65535, 65535, 65535,
@@ -50,7 +50,7 @@ def imu_message(us: int, force: tuple[float, ...], rates: tuple[float, ...]) -> 
 
 
 def pressure_message(ms: int, pascal: float) -> Any:
-    """SCALED_PRESSURE. ms: time since boot; pascal: absolute pressure."""
+    """SCALED_PRESSURE. pascal: absolute pressure."""
     return mavlink.MAVLink_scaled_pressure_message(ms, pascal * 0.01, 0.0, 0)
 
 

@@ -99,11 +99,13 @@ class PhotoTags:
         return (width > height) != (self.width > self.height)
 
     def telemetry(self) -> Telemetry:
-        """Position and direction, as far as the tags contain them."""
+        """Position and direction, as far as known. `FootageError` for a position off the Earth."""
         return Telemetry(self.time_ns, self._position(), self.view(), self._course())
 
     def view(self) -> RecordedView | None:
-        """The measured camera direction, by the first maker's convention that fits; or None."""
+        """The measured camera direction, by the first maker's convention that fits; None if no tag
+        has it, or all angles are exactly zero (`has_zero_view`).
+        """
         for names, convert in _VIEWS:
             angles = [self.number(name) for name in names]
             values = [a for a in angles if a is not None]
@@ -216,7 +218,7 @@ def looking_down(heading_deg: float | None) -> RecordedView:
 
 
 def read_photo_tags(path: Path) -> PhotoTags:
-    """Tags of a photo, or of a sidecar alone; `FootageError` if the file is no image."""
+    """Tags of a photo, or of a sidecar (.xmp) alone, size 0; `FootageError` if it is no image."""
     if path.suffix.lower() == ".xmp":
         return PhotoTags(path, 0, 0, xmp=_read_xmp(path))
     try:

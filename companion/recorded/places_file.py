@@ -46,7 +46,9 @@ _LIMITS = {  # degrees; seconds since 1970, whose nanoseconds fit 64 bits; metre
 
 
 def read_places(path: Path) -> dict[str, Telemetry]:
-    """Telemetry by photo name. `FootageError` if the file has no position."""
+    """Telemetry by photo name, as the file writes it; position None for 0, 0. `FootageError` for a
+    file without lines of positions, a line that is none, and a name that is repeated.
+    """
     try:
         lines = plain_text(path).removeprefix("\ufeff").splitlines()
         rows = list(_rows(lines))

@@ -43,7 +43,8 @@ def is_sequence(folder: Path) -> bool:
 
 def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
     """Read a sequence of either layout; `name` selects one of PiLoT's. `SequenceError` if the
-    folder or an image is missing, or exposure times do not increase.
+    folder or an image is missing, or exposure times do not increase; `PoseFileError`,
+    `CameraError`, `StreamDecodeError` for the files of poses, camera and times.
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: no such folder")
@@ -67,7 +68,10 @@ def read_sequence(folder: Path, name: str | None = None) -> RecordedFlight:
 
 
 def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Sequence:
-    """As a `Sequence` with recorded poses as truth in this frame; `SequenceError` without them."""
+    """As a `Sequence` with the recorded poses as truth in this map frame; `SequenceError` if one is
+    missing. geoid_m: geoid above the ellipsoid, for heights above sea level. Without increasing
+    times, frames are taken as 1/30 s apart.
+    """
     truth = [_pose(one.telemetry, frame, geoid_m) for one in flight.frames]
     whole = tuple(pose for pose in truth if pose is not None)
     if len(whole) < len(truth) or not whole:
@@ -84,7 +88,7 @@ def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Se
 
 
 def load_sequence(folder: Path, frame: LocalFrame, name: str | None = None) -> Sequence:
-    """Read a sequence folder in a map's frame."""
+    """Read a sequence folder (`read_sequence`) as a `Sequence` in a map's frame."""
     return sequence_of(read_sequence(folder, name), frame, 0.0)
 
 

@@ -13,12 +13,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.errors import FootageError
 from companion.recorded.log_messages import (
     Dated,
-    autopilot,
     imu_message,
     position_message,
     pressure_message,
     range_message,
     receiver_message,
+    sent_by_autopilot,
 )
 
 _PX4, _ARMED = 12, 2
@@ -50,7 +50,7 @@ def ulog_messages(path: Path) -> Iterator[Dated]:
         row = {field: values[k] for field, values in topics[name].items()}
         message = _TOPICS[name](row, us, float(home[0]))
         if message is not None:
-            yield from autopilot((us + utc_us) * 1000, message)
+            yield from sent_by_autopilot((us + utc_us) * 1000, message)
 
 
 def _subsampled(times_us: np.ndarray) -> np.ndarray:

@@ -104,8 +104,10 @@ def _length_s(path: Path) -> float:
 def extract_frames(
     path: Path, folder: Path, times_ns: list[int], progress: Callable[[int, int], None]
 ) -> list[ExtractedFrame]:
-    """Write the first frame at or after each of the ascending times, at most `_LARGEST_PX` wide.
-    `FootageError` if no frame can be decoded.
+    """Write the first frame at or after each of the ascending times as a JPEG, at most 1920 px
+    wide, into the folder, which is created. Times count from the first frame. A frame is written
+    once, so there may be fewer than times. progress: called with (written, times). `FootageError`
+    if no frame can be decoded.
     """
     folder.mkdir(parents=True, exist_ok=True)
     frames: list[ExtractedFrame] = []

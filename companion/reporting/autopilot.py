@@ -51,8 +51,8 @@ class AutopilotTracks:
 def read_autopilot(
     tlog: Path | None, start_ns: int, utc_ns: int, pictures: MapPictures
 ) -> AutopilotTracks:
-    """Read the tracks from the record's `bridge.tlog`; none without one.
-
+    """Read the tracks from the record's `bridge.tlog`, in the frame of the map that `pictures` has
+    open. None without log, map or UTC; a log that cannot be read is noted in `pictures.notes`.
     start_ns, utc_ns: the record's begin on CLOCK_MONOTONIC and in UTC, 0 if unknown.
     """
     if tlog is None or pictures.cache is None or not utc_ns:

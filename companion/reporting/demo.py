@@ -44,7 +44,9 @@ _TARGET_LIMIT_M = 3.0
 
 
 def demo_report(folder: Path, say: Say = silent) -> Report:
-    """Make the report of `python -m sitl demo --out folder`. `RecordError` for another folder."""
+    """Make the report of `python -m sitl demo --out folder`; writes nothing. say: receives the
+    present step as text. `RecordError` for another folder.
+    """
     record = read_record(folder / "companion")
     try:
         document = json.loads(plain_text(folder / "report.json"))

@@ -30,8 +30,8 @@ _TEXT = ("name", "state", "status", "problem")
 
 
 def evaluation_report(folder: Path, say: Say = silent) -> Report:
-    """Make the report of `companion eval --report folder`. `RecordError` for another folder, or
-    without frames.
+    """Make the report of `companion eval --report folder`; writes nothing. say: receives the
+    present step as text. `RecordError` for another folder, or without frames.
     """
     try:
         document = json.loads(plain_text(folder / "report.json"))

@@ -45,7 +45,7 @@ def track(name: str, colour: str, width: float, columns: Columns, prefix: str = 
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray, within_ns: int = _NEAR_NS) -> np.ndarray:
-    """For each wanted time the index of the nearest of `times` (sorted), or -1."""
+    """For each wanted time (ns) the index of the nearest of sorted `times` within 2 ms, or -1."""
     if not len(times):
         return np.full(len(wanted), -1)
     right = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
@@ -102,8 +102,9 @@ def first_fault(
     estimates: Columns, time_s: np.ndarray, happened: Sequence[ReportEvent], large_error: str = "",
     since_s: float | None = None,
 ) -> str:  # fmt: skip
-    """The first fault after localization began, as text. large_error: text of the first large
-    error, if the truth is known. since_s: a fault before it counts only if there is no later one.
+    """The first fault after localization began, as text; it begins with `NOTHING` without one.
+    large_error: "SECONDS TEXT" of the first large error, if the truth is known, or "". since_s: a
+    fault before it counts only if there is no later one.
     """
     states = np.asarray(estimates.get("state", np.empty(0)))
     began = np.flatnonzero(states == "tracking")
@@ -167,7 +168,9 @@ def by_name(targets: Columns) -> dict[str, np.ndarray]:
 def target_table(
     targets: Columns, errors: Mapping[str, np.ndarray] | None = None, limit_m: float | None = None
 ) -> ReportTable | None:
-    """One row for each target: last position and, if the truth is known, errors."""
+    """One row for each target: last position and, if the truth is known, errors; None without a
+    target. errors: by target (3,) median, p95 and maximum, m; limit_m: of p95, beyond it is bad.
+    """
     grouped = by_name(targets)
     known = errors or {}
     names = [*grouped, *(n for n in known if n not in grouped)]

@@ -14,7 +14,7 @@ from av.sidedata.sidedata import Type as SideDataType
 
 from companion.errors import RecordError, StreamOpenError
 from companion.klv.local_set import encode
-from companion.klv.metadata import KlvContext, picture_fields
+from companion.klv.metadata import KlvContext, frame_fields
 from companion.klv.transport import TransportWriter
 from companion.offline.record import RecordTables, read_record
 from companion.offline.tables import Columns, poses
@@ -54,7 +54,8 @@ def describe_recording(
     """Write `video` as MPEG-TS with ST 0601 metadata for each localized frame.
 
     begin_s: exposure of its first frame, seconds since the record's start; None if the frames have
-    MISP timestamps. Raises `RecordError`, `StreamOpenError`.
+    MISP timestamps. `RecordError`, also if no frame was localized (then `out` is removed), and
+    `StreamError`; OSError if `out` cannot be written.
     """
     tables = read_record(record)
     map_path = map_cache or tables.map_path
@@ -180,7 +181,7 @@ class _RecordTrack:
         j = _nearest(times, time_ns, _ATTITUDE_NS)
         if j is not None:
             body = matrix_from_euler(*angles[j])
-        fields = picture_fields(estimate, self._scene, body, self._target(time_ns))
+        fields = frame_fields(estimate, self._scene, body, self._target(time_ns))
         return encode((time_ns + self._utc_ns) // 1000, fields)
 
     def _target(self, time_ns: int) -> TargetFix | None:

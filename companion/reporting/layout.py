@@ -39,7 +39,7 @@ _COLOURS = {
 
 
 def write_report(report: Report, path: Path) -> Path:
-    """Write the page; `ReportError` if the disk does not accept it."""
+    """Write the page into an existing folder and return `path`; `ReportError` if that fails."""
     with writing(path):
         path.write_text(render(report), encoding="utf-8")
     return path
@@ -326,7 +326,7 @@ def _settings(report: Report) -> str:
 
 
 def data_uri(rgb: Image) -> str:
-    """An image as a data URI. `ReportError` if it cannot be encoded."""
+    """An RGB image as a data URI (JPEG). `ReportError` if it cannot be encoded."""
     done, jpeg = cv2.imencode(
         ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     )

@@ -52,7 +52,9 @@ class MapPictures:
     say: Say = silent
 
     def sheet(self, tracks: Sequence[MapTrack], marks: Sequence[MapMark]) -> MapSheet | None:
-        """Top view of the square about all tracks and marks; None without any."""
+        """Top view of the square about all tracks and marks, with 60 m around; None without any.
+        Without a map it has no image.
+        """
         places = [t.points[np.isfinite(t.points).all(axis=1)] for t in tracks]
         points = np.vstack([*places, *([[m.east_m, m.north_m]] for m in marks), np.empty((0, 2))])
         if not len(points):
@@ -76,8 +78,9 @@ class MapPictures:
     def overlays(
         self, frames: Sequence[ShownFrame], camera: Camera, size: Camera | None = None
     ) -> tuple[Overlay, ...]:
-        """Each frame, undistorted, and the map rendered at its pose. size: camera at the images'
-        size, otherwise `camera`.
+        """Each frame, undistorted, and the map rendered at its pose; () without a map. A frame that
+        cannot be used is left out and noted. camera: of the frames; size: the same camera at the
+        size of the overlays, None: at its own.
         """
         if self.renderer is None:
             return ()

@@ -34,7 +34,9 @@ GNSS = "#ffffff"
 
 
 def record_report(folder: Path, say: Say = silent) -> Report:
-    """Make the report of one record; `RecordError` for another folder."""
+    """Make the report of one record; writes nothing. say: receives the present step as text.
+    `RecordError` for another folder.
+    """
     tables = read_record(folder)
     camera, estimates = tables.camera, tables.estimates
     start_ns = tables.start_ns
@@ -79,10 +81,10 @@ def record_report(folder: Path, say: Say = silent) -> Report:
 def worst_frames(
     tables: RecordTables, goodness: np.ndarray, what: str, time_s: np.ndarray
 ) -> list[ShownFrame]:
-    """Recorded frames with the lowest `goodness` (one value per estimate), worst first; NaN is
-    worst.
-
-    Frames of a refused estimate take at most half the places, if others are there.
+    """At most eight recorded frames with the lowest `goodness` (one value per estimate; NaN is
+    worst), worst first, those of a refused estimate last.
+    Refused ones take at most half the places, if others are there. what: names `goodness` in the
+    captions; time_s: of each estimate.
     """
     estimates = tables.estimates
     paths = sorted((tables.folder / "snapshots").glob("*.jpg"))

@@ -17,8 +17,9 @@ NAME = "report.html"
 
 
 def write_page(folder: Path, out: Path | None = None, say: Say = silent) -> Path:
-    """Write the report of a record, a demo or an evaluation; returns its path. say: receives
-    progress.
+    """Write the report of a record, a demo or an evaluation to `out`, or ``report.html`` in its
+    folder; returns the path. say: receives the present step as text. `RecordError` as of
+    `report_of`, `ReportError` if it cannot be written.
     """
     report = report_of(folder, say)
     path = out or folder / NAME
@@ -27,7 +28,7 @@ def write_page(folder: Path, out: Path | None = None, say: Say = silent) -> Path
 
 
 def report_of(folder: Path, say: Say = silent) -> Report:
-    """Make the folder's report; `RecordError` for another kind or a damaged folder."""
+    """Make the folder's report, write nothing; `RecordError` if its kind or content is wrong."""
     try:
         return _report_of(folder, say)
     # What a damaged or a foreign file raises where a report takes it apart.

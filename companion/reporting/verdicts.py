@@ -80,5 +80,5 @@ def value_and_limit(
 
 
 def advice(name: str) -> Advice:
-    """Explanation of the criterion with that name."""
+    """Explanation of the criterion whose name begins with a known one; otherwise a general one."""
     return next((a for begin, a in _ADVICE.items() if name.startswith(begin)), _UNKNOWN)

@@ -17,18 +17,18 @@ _ANY_GREY = (0, 65535)  # of a size, levels do not matter
 
 
 @dataclass(frozen=True)
-class Seen:
+class StreamSize:
     """Frame size of a stream, pixels."""
 
     width: int
     height: int
 
 
-def read_stream_size(source: str) -> Seen:
-    """Read the frame size of a stream; `StreamError` if no frame arrives in time."""
+def read_stream_size(source: str) -> StreamSize:
+    """Frame size of a stream or of a folder's first image; `StreamError` if none in 10 s."""
     if "://" not in source and Path(source).is_dir():  # pictures are taken at their own size there
         height, width = read_image(list_images(Path(source))[0], _ANY_GREY).shape[:2]
-        return Seen(width, height)
+        return StreamSize(width, height)
     told: list[str] = []
 
     def on_state(state: StreamState, text: str) -> None:
@@ -41,11 +41,11 @@ def read_stream_size(source: str) -> Seen:
     try:
         for frame in feed.frames():
             height, width = frame.image.shape[:2]
-            return Seen(width, height)
+            return StreamSize(width, height)
     except StreamSizeError as error:  # of another shape than the guess, as most thermal ones are
         if error.size is None:
             raise
-        return Seen(*error.size)
+        return StreamSize(*error.size)
     finally:
         timer.cancel()
         feed.close()

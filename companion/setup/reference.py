@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from companion.config import CompanionConfig
-from companion.settings_file import settings
+from companion.settings_file import settable_fields
 
 # What must be given: no default can be right.
 _EXAMPLES: dict[str, Any] = {
@@ -47,7 +47,7 @@ def reference() -> str:
 
 def _lines(model: type[BaseModel], default: BaseModel | None, depth: int) -> Iterator[str]:
     """Lines of a model's settings. default: its value if it is left out, None: the model's own."""
-    for name, field in settings(model).items():
+    for name, field in settable_fields(model).items():
         indent = "  " * depth
         value = _default(field) if default is None else getattr(default, name)
         part = _part(field)

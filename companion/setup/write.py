@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
-from companion.settings_file import settings
+from companion.settings_file import settable_fields
 
 
 def deployment_text(
@@ -29,7 +29,7 @@ def deployment_text(
 
 
 def write_deployment(text: str, path: Path, overwrite: bool) -> None:
-    """Write the file; `ConfigError` if it exists already or cannot be written."""
+    """Write the file; `ConfigError` if that fails, or it exists and `overwrite` is False."""
     try:
         with path.open("w" if overwrite else "x", encoding="utf-8") as file:
             file.write(text)
@@ -44,7 +44,7 @@ def differing_settings(model: BaseModel, default: BaseModel | None = None) -> di
     as plain data. Settings without a default are all given.
     """
     found: dict[str, Any] = {}
-    for name, field in settings(type(model)).items():
+    for name, field in settable_fields(type(model)).items():
         now = getattr(model, name)
         if default is None and field.is_required():
             found[name] = _plain(now)

@@ -191,7 +191,10 @@ class VideoFileSource:
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame. `StreamOpenError` for no video, `StreamDecodeError` if no frame decodes."""
+        """Every frame, with `realtime` at the times recorded. `StreamOpenError` for no video,
+        `StreamDecodeError` if no frame decodes; `StreamSizeError` and `StreamDepthError` for frames
+        that do not fit.
+        """
         try:
             decoder = VideoDecoder(_Input(str(self._path), {}), None, self._tap)
         except av.error.FFmpegError as error:
@@ -333,8 +336,7 @@ class LiveVideoSource:
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """Wait for the newest frame and yield it; ends only when closed.
-
+        """Start the reader, wait for the newest frame and yield it; ends only when closed.
         Raises `StreamSizeError` if the first frame has another aspect ratio than the camera model,
         `StreamDepthError` if its pixels cannot be converted. Later frames of this kind are skipped,
         with state MISFIT until a frame fits.
@@ -521,9 +523,9 @@ def live_input(
     settings: SourceSettings,
     on_stranger: Callable[[str], None] = lambda _: None,
 ) -> _Input:
-    """FFmpeg's options for a live location, chosen for low delay. camera: gives the image size that
-    a V4L2 device is set to. on_stranger: as of `open_source`. `StreamOpenError` if the video device
-    does not exist.
+    """How FFmpeg opens a live location, with options for low delay; opens nothing. camera: gives
+    the image size that a V4L2 device is set to. on_stranger: as of `open_source`. `StreamOpenError`
+    for a wrong location or .sdp file, and if the video device does not exist.
     """
     timeout_us = str(round(settings.stall_timeout_s * 1e6))
     common = {"probesize": "65536", "analyzeduration": "200000", "flags": "low_delay"}
@@ -605,7 +607,7 @@ def _pts_ns(picture: av.VideoFrame) -> int | None:
 
 def _pass_exposure_time(tap: PacketTap | None, picture: av.VideoFrame, exposure_ns: int) -> None:
     if tap is not None and picture.pts is not None and picture.time_base is not None:
-        tap.picture(Fraction(picture.pts * picture.time_base), exposure_ns)
+        tap.frame_exposed(Fraction(picture.pts * picture.time_base), exposure_ns)
 
 
 def _misp_time(picture: av.VideoFrame) -> MispTime | None:

@@ -154,8 +154,10 @@ class PacketTap(Protocol):
         """The next packet in decoding order; the tap may keep it."""
         ...
 
-    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """A frame of presentation time `pts` (s) was exposed then (CLOCK_MONOTONIC)."""
+    def frame_exposed(self, pts: Fraction, exposure_time_ns: int) -> None:
+        """A frame of presentation time `pts` (s) was decoded; it was exposed then
+        (CLOCK_MONOTONIC).
+        """
         ...
 
 
@@ -175,10 +177,10 @@ class PacketTaps:
         for tap in self._taps:
             tap.packet(packet)
 
-    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+    def frame_exposed(self, pts: Fraction, exposure_time_ns: int) -> None:
         """As of `PacketTap`."""
         for tap in self._taps:
-            tap.picture(pts, exposure_time_ns)
+            tap.frame_exposed(pts, exposure_time_ns)
 
 
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
@@ -236,7 +238,7 @@ class FrameSource(Protocol):
 
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
     """Camera model for frames of width x height pixels: the calibrated one, scaled if necessary.
-    where: location for the error text.
+    where: location for the error text. `StreamSizeError` for another aspect ratio.
     """
     if (width, height) == (camera.width, camera.height):
         return camera

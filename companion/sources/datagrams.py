@@ -130,11 +130,11 @@ class SenderLock:
         return self._sender is not None or self._only is not None
 
     def confirm_sender(self) -> None:
-        """A frame of the accepted sender was decoded."""
+        """A frame of the accepted sender was decoded: no other address replaces it any more."""
         self._proven = True
 
     def accepts(self, sender: Address, data: bytes, now_ns: int) -> bool:
-        """Whether to use a datagram that arrived now; its sender may become the accepted one."""
+        """Whether to use a datagram of now; one with video may make its sender the accepted."""
         if sender == self._sender or self._becomes_sender(sender, data, now_ns):
             self._heard_ns = now_ns
             return True
@@ -209,7 +209,7 @@ class VideoDatagrams:
                 return
 
     def format(self) -> str:
-        """Wait for video; FFmpeg's name of its format. `SilentSenderError` after `patience_s`."""
+        """Wait for video, after `begin`; FFmpeg's name of it. `SilentSenderError` as of `read`."""
         self._pending = self._next()
         return FORMATS[self._kind or "mpegts"]  # None: closed
 

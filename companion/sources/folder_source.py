@@ -103,9 +103,9 @@ def exposure_times_of(folder: Path, images: Sequence[Path]) -> tuple[int, ...] |
 
 
 class FolderSource:
-    """Frames from the images of a folder. Exposure times (ns) are those of ``timestamps.txt``;
-    without that file, they begin now and follow at `rate_hz`. With `realtime`, recorded times are
-    shifted to begin now.
+    """Frames from the images of a folder (`StreamOpenError` without any). Exposure times (ns) are
+    those of ``timestamps.txt``; without that file, they begin when `frames` does and follow at
+    `rate_hz`. With `realtime`, recorded times are shifted to begin then.
     """
 
     def __init__(

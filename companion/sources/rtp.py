@@ -173,7 +173,7 @@ class RtpDepacketizer:
         if begins:
             units = self.sets + units
         if self.codec == "hevc":
-            return self._transport.picture(units, self._since)
+            return self._transport.encode_frame(units, self._since)
         return (_ivf_header() if begins else b"") + _ivf_frame(units, self._since)
 
 

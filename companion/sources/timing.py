@@ -43,7 +43,9 @@ class MinimumLag:
     _last_sender: int = field(default=-(2**63))
 
     def map(self, sender_ns: int, arrival_ns: int) -> int:
-        """`sender_ns` as CLOCK_MONOTONIC (ns), of a message that arrived at `arrival_ns`."""
+        """`sender_ns` as CLOCK_MONOTONIC (ns), of a message that arrived at `arrival_ns`. Call it
+        in order of arrival; a sender's clock that goes back or jumps by 2 s is learned anew.
+        """
         lag = arrival_ns - sender_ns
         if self._is_discontinuity(lag, sender_ns):
             self._current = self._previous = None
@@ -86,7 +88,7 @@ class ExposureClock:
         self._held = False
 
     def exposure_time(self, stamps: FrameTimestamps, arrival_ns: int) -> int:
-        """CLOCK_MONOTONIC nanoseconds of the exposure of a frame that arrived at `arrival_ns`."""
+        """CLOCK_MONOTONIC ns of the exposure of the next frame, which arrived at `arrival_ns`."""
         if self._device and stamps.pts_ns is not None and _plausible(stamps.pts_ns, arrival_ns):
             return stamps.pts_ns
         if stamps.misp is not None and self._timing == "auto":

@@ -20,8 +20,10 @@ class TransportStream:
     def __init__(self) -> None:
         self._counts = {0: 0, _PMT: 0, _VIDEO: 0}
 
-    def picture(self, data: bytes, time: int) -> bytes:
-        """Encode one frame. data: Annex B; time: in 1/90000 s since the first frame."""
+    def encode_frame(self, data: bytes, time: int) -> bytes:
+        """The next frame as MPEG-TS packets. data: its H.265, Annex B; time: its presentation time,
+        in 1/90000 s since the first frame.
+        """
         video = 0xE000 | _VIDEO
         pat = struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 1, 0xE000 | _PMT)
         pmt = struct.pack(">HBBBHHBHH", 1, 0xC1, 0, 0, video, 0xF000, _HEVC, video, 0xF000)

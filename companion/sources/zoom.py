@@ -128,8 +128,8 @@ class ZoomedFrames:
         self.unknown = 0  # frames
 
     def __call__(self, frame: Frame) -> Frame | None:
-        """The frame with its camera model. None if the focal length is unknown, because the fix
-        would be wrong by metres and look as good as any.
+        """The frame with its camera model. If the focal length is unknown, an alert is reported and
+        None returned, because the fix would be wrong by metres and look as good as any.
         """
         level = self._level_at(frame.exposure_time_ns, self._table.hold_s)
         factor = None if level is None else self._table.factor(level)
@@ -159,7 +159,9 @@ class ZoomedFrames:
         return hand_on
 
     def learn(self, estimate: PoseEstimate) -> None:
-        """Correct the table by a registered frame's focal length; any thread, never blocks."""
+        """Correct the table by a registered frame's focal length; any thread, never blocks. Ignored
+        if the table's `refine` is 0, or the zoom has changed since.
+        """
         fit = estimate.focal
         if fit is None or not self._table.refine:
             return
@@ -171,7 +173,7 @@ class ZoomedFrames:
 
     @property
     def factor(self) -> float | None:
-        """Focal length of the newest frame with known zoom, as a multiple of the model's."""
+        """Focal length of the newest frame with known zoom, times the model's; None without one."""
         with self._lock:
             return self._factor
 

@@ -12,7 +12,9 @@ from companion.errors import ConfigError
 
 
 def keep_settings(config: CompanionConfig) -> int:
-    """Keep the deployment in memory; returns a file descriptor that child processes inherit."""
+    """Keep the deployment in memory; returns its file descriptor, to be passed to child processes
+    (`pass_fds`) for their `settings_of`.
+    """
     with open(os.memfd_create("deployment"), "wb") as file:
         # Escaped: a folder's name may be no UTF-8.
         file.write(json.dumps(config.model_dump(mode="json")).encode())
@@ -24,7 +26,7 @@ def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:
     """The deployment of a file; if the file cannot be read, the kept deployment and the reason.
 
     kept: the descriptor returned by `keep_settings`; None at a first start, where an unreadable
-    file is an error.
+    file is a `ConfigError`.
     """
     try:
         return load_config(path), ""

@@ -23,8 +23,8 @@ class Beat:
 
 
 class FlightProcess:
-    """Starts and controls a flight process. standby: it is started with ``--standby``, prepares and
-    waits. hands_on: inherited file descriptors.
+    """Starts (in the constructor; OSError) and controls a flight process. standby: it is started
+    with ``--standby``, prepares and waits. hands_on: inherited file descriptors.
 
     It has its own process group, so that the terminal's interrupt reaches it through the supervisor
     only. It has no session of its own, because Linux schedules each session as one group and would
@@ -69,13 +69,13 @@ class FlightProcess:
             return None
 
     def close(self) -> None:
-        """Close the pipes."""
+        """Close the pipe of the signs of life, also repeatedly; the process goes on."""
         if self._beats >= 0:
             os.close(self._beats)
             self._beats = -1
 
     def beats(self) -> tuple[Beat, ...]:
-        """Signs of life since the last call."""
+        """Signs of life since the last call, oldest first. Never blocks."""
         try:
             while data := os.read(self._beats, _READ):
                 self._unread += data
@@ -86,17 +86,19 @@ class FlightProcess:
         return tuple(beat for line in lines if (beat := _beat(line)) is not None)
 
     def kill(self) -> None:
-        """Kill a process that hangs."""
+        """Kill it (SIGKILL), and wait up to 10 s until it is gone."""
         self._process.kill()
         self.wait(_KILL_S)
 
-    def interrupt(self, number: int) -> None:
+    def send_signal(self, number: int) -> None:
         """Send the signal `number`; harmless if the process has ended."""
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
 
     def dismiss(self) -> None:
-        """End an unused standby."""
+        """End an unused standby: close its input, kill it if it has not ended after 5 s, and close
+        the pipes.
+        """
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()

@@ -39,8 +39,8 @@ class Pulse:
         self._thread.start()
 
     def stop(self, *, clean_shutdown: bool) -> None:
-        """Announce the end and stop. After a clean shutdown the supervisor allows time to close a
-        recording; after an error it restarts soon.
+        """Stop the thread, announce the end and close the pipe. After a clean shutdown the
+        supervisor allows time to close a recording; after an error it restarts soon.
         """
         self._stop.set()
         ended = wait_for_end(self._thread)
@@ -61,7 +61,9 @@ class Pulse:
 
 
 def line(beats: Mapping[str, int], now_ns: int) -> bytes:
-    """The line for now_ns; ``all 0`` without components."""
+    """The line of `Pulse` for now_ns, with `-` for blanks in the name; ``all 0`` without
+    components. beats: times of their last cycles, ns.
+    """
     if not beats:
         return b"all 0\n"
     name = min(beats, key=lambda one: beats[one])

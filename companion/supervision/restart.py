@@ -24,7 +24,8 @@ def without_lost_disks(
     config: CompanionConfig, probe: Callable[[Path], str] | None = None
 ) -> tuple[CompanionConfig, str]:
     """The deployment without the files whose disk is gone, and a text on what was left out (empty:
-    nothing). A full or failing disk is reported by the component that writes (`DiskFaultError`).
+    nothing). Takes up to 3 s. A full or failing disk is reported by the component that writes
+    (`DiskFaultError`).
 
     probe: returns why a folder cannot be written to, empty if it can; called for each folder on a
     thread of its own. The default creates the folder if necessary, and writes and removes a file in
@@ -72,7 +73,9 @@ def _lost(folders: Iterable[Path], probe: Callable[[Path], str]) -> dict[Path, s
 
 
 def write_problem(folder: Path) -> str:
-    """Why a folder cannot be written to; "" if it can, or if the disk is full."""
+    """Why a folder cannot be written to; "" if it can, or if the disk is full or failing. Creates
+    the folder if missing; may block as long as the disk does.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=".again-", dir=folder)

@@ -25,7 +25,9 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> ServiceManager:
-        """From NOTIFY_SOCKET, which is removed so that child processes do not use it."""
+        """From NOTIFY_SOCKET, "" if not set. It is removed from `environment`, so that child
+        processes do not use it.
+        """
         return cls(environment.pop(_VARIABLE, ""))
 
     def close(self) -> None:
@@ -43,7 +45,7 @@ class ServiceManager:
         self._say("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """Set the line for `systemctl status`."""
+        """Set the line for `systemctl status`, cut to 200 characters."""
         self._say(f"STATUS={text[:_LONGEST]}")
 
     def _say(self, text: str) -> None:

@@ -59,7 +59,7 @@ class Process(Protocol):
     def close(self) -> None:
         """Close the pipes."""
 
-    def interrupt(self, number: int) -> None:
+    def send_signal(self, number: int) -> None:
         """Send the signal `number`; harmless if the process has ended."""
 
     def dismiss(self) -> None:
@@ -139,8 +139,9 @@ class Supervisor:
         self._stopping = False
 
     def run(self) -> int:
-        """Supervise; returns the exit code of the process that ended normally, or of the last one
-        after `stop`.
+        """Start the first process and supervise until one ends with exit code 0, or after `stop`,
+        or the first with a named error (2); returns that code. Other ends are followed by a
+        restart. OSError if the first process cannot be started.
         """
         self._fly(self._spawn(False), self._policy.cold_s)
         try:
@@ -166,10 +167,10 @@ class Supervisor:
                 self._standby.dismiss()
 
     def stop(self, number: int) -> None:
-        """Pass the signal `number` on, and end with the flight process; for a signal handler."""
+        """Pass the signal `number` on; `run` ends with the flight process. For a signal handler."""
         self._stopping = True
         if self._flying is not None:
-            self._flying.interrupt(number)
+            self._flying.send_signal(number)
 
     def _fly(self, process: Process, patience_s: float) -> None:
         if self._flying is not None:
@@ -179,7 +180,7 @@ class Supervisor:
         self._shown_s, self._is_new = None, True
         self._patience_s = patience_s
         if self._stopping:
-            process.interrupt(signal.SIGINT)
+            process.send_signal(signal.SIGINT)
 
     def _watch(self) -> int | None:
         assert self._flying is not None
@@ -318,7 +319,7 @@ def _do_in_time(name: str, do: Callable[[], None]) -> None:
 
 
 def exit_code_text(code: int) -> str:
-    """An exit code in words, for the operator."""
+    """An exit code of `subprocess` in words, as "exit 1" or "SIGKILL"."""
     if code >= 0:
         return f"exit {code}"
     try:
@@ -328,10 +329,8 @@ def exit_code_text(code: int) -> str:
 
 
 def mark_dead(folder: Path, pid: int, text: str) -> None:
-    """Write the death into the ``health.json`` of process `pid`, in the record at `folder` or
-    beside it.
-
-    Without such a file nothing is written.
+    """Write the death into the ``health.json`` of process `pid`, in `folder` or a record beside it
+    whose name begins likewise. Without such a file nothing is written; OSError if the disk refuses.
     """
     for path in folder.parent.glob(f"{glob.escape(folder.name)}*/health.json"):
         report = _report(path)

@@ -45,7 +45,7 @@ class ClickPolicy:
         self._lock = threading.Lock()  # two links may both have a ground station
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle | None = None) -> None:
-        """Add an accepted estimate, and process the clicks that wait for its time. Never blocks."""
+        """Add an estimate (its pose if accepted) and process clicks that waited. Never blocks."""
         if estimate.accepted:
             self._history.add(estimate)
         if not self._waiting:
@@ -56,7 +56,10 @@ class ClickPolicy:
             ]
 
     def on_request(self, request: TrackRequest) -> None:
-        """Begin the target of a click, or end targets if its kind is "stop". Never blocks."""
+        """Begin the target of a click, or refuse it with an alert; it waits up to 2 s for the pose
+        of its frame. Kind "stop": end the clicked target of its number, or all for number 0. Never
+        blocks.
+        """
         with self._lock:
             if request.kind == "stop":
                 self._stop(request.number)
@@ -64,7 +67,7 @@ class ClickPolicy:
                 self._waiting.append(request)
 
     def on_gone(self, name: str) -> None:
-        """Remove a target that has ended from the clicked ones (at most 8 at a time)."""
+        """A target of that name has ended: it no longer counts among the 8 clicked ones."""
         with self._lock:
             self._alive = [c for c in self._alive if c.name != name]
 

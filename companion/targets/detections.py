@@ -113,8 +113,8 @@ def parse_host_port(text: str) -> tuple[str, int]:
 
 
 class DetectionListener:
-    """Receives detections over UDP on a thread. Invalid datagrams are counted and ignored. Targets
-    of two senders with the same name are kept apart (`Senders`).
+    """Receives detections over UDP on a thread, from its construction on. Invalid datagrams are
+    counted and ignored. Targets of two senders with the same name are kept apart (`Senders`).
 
     address: host:port to listen at; `ConfigError` if it cannot be used. on_detection: called on
     that thread.
@@ -139,7 +139,7 @@ class DetectionListener:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening, wait for the thread, and free the port."""
         self._stop.set()
         wait_for_end(self._thread)
         self._socket.close()

@@ -35,7 +35,9 @@ class FrameTimes:
         self.unmatched = 0
 
     def add_detection(self, detection: Detection, name: FrameName | None = None) -> None:
-        """Pass a detection on. With a frame name, it waits for the frame's exposure time first."""
+        """Pass a detection on, in the caller's thread. With a frame name it waits for the frame's
+        exposure time; of more than 64 that wait, the oldest is dropped and counted.
+        """
         if name is None:
             self._on_detection(detection)
             return
@@ -68,7 +70,7 @@ class FrameTimes:
     def packet(self, packet: av.Packet) -> None:
         """Does nothing; part of `PacketTap`."""
 
-    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+    def frame_exposed(self, pts: Fraction, exposure_time_ns: int) -> None:
         """Store a frame's presentation time (s) and exposure time (CLOCK_MONOTONIC). Pass on the
         detections that waited for it, in the caller's thread.
         """

@@ -111,7 +111,9 @@ class TargetReporter:
             self._pictures.append(frame)
 
     def forget(self, names: tuple[str, ...]) -> None:
-        """End the targets of these names and drop their waiting detections. Never blocks."""
+        """End the targets of these names and drop their waiting detections; on_gone receives those
+        that were active. Never blocks.
+        """
         with self._condition:
             self._forgotten += names
             kept = (d for d in self._detections if d.target_id not in names)

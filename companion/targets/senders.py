@@ -36,7 +36,7 @@ class Senders:
         self._names: OrderedDict[str, _Named] = OrderedDict()
 
     def name_of(self, target_id: str, sender: Address, now_ns: int) -> str:
-        """The target's name, with a number if senders share it. now_ns: CLOCK_MONOTONIC."""
+        """The target's name, numbered if senders share it; for each detection. CLOCK_MONOTONIC."""
         named = self._names.setdefault(target_id, _Named())
         self._names.move_to_end(target_id)
         if len(self._names) > _NAMES:

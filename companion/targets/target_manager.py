@@ -182,7 +182,9 @@ class TargetManager:
         self.refused = 0
 
     def begin(self, click: Click) -> None:
-        """Start the target of a click and report its position, or an alert why there is none."""
+        """Start the target of a click and report its position. If there is none, an alert says why,
+        and on_gone receives the name.
+        """
         name, time_ns = click.name, click.estimate.exposure_time_ns
         track = TargetTrack(name, replace(self._settings, confirm_s=0.0), self._cast)
         fix = track.observe(click.estimate, click.pixel, drift=self._drift(click))
@@ -205,8 +207,8 @@ class TargetManager:
         self._follow(name, life, click, fix)
 
     def add_detection(self, detection: Detection, estimate: PoseEstimate) -> None:
-        """Update a target by a detection in the estimate's frame, and report its position; at most
-        `rate_hz` times a second.
+        """Update a target by a detection in the estimate's frame, and report its position; more
+        than `rate_hz` detections a second are ignored.
         """
         name, time_ns = detection.target_id, estimate.exposure_time_ns
         life = self._lives.get(name)
@@ -238,7 +240,9 @@ class TargetManager:
             self._look_for(name, life, estimate, gray)
 
     def predict(self, estimate: PoseEstimate) -> None:
-        """Report each clicked target at a newer frame; end those out of view too long."""
+        """Report each clicked target at the estimate's frame, at most `rate_hz` times a second; end
+        those that were outside the image for `timeout_s`.
+        """
         for name, life in [(n, x) for n, x in self._lives.items() if x.is_clicked]:
             time_ns = estimate.exposure_time_ns
             if not self._is_due(life, time_ns):

@@ -60,7 +60,8 @@ class _Queue(QueueHandler):
 
 @contextlib.contextmanager
 def console_log(verbose: bool, descriptor: int = 1) -> Iterator[None]:
-    """Context manager: log to a file descriptor, by default standard output.
+    """Context manager: log to a file descriptor, by default standard output. Records beyond 1000
+    that wait are lost; the end waits up to 2 s for the rest.
 
     verbose: of our own packages, because numba's own log is endless.
     """

@@ -25,7 +25,9 @@ _NEEDED = ("starlette", "uvicorn", "websockets")
 
 @contextlib.contextmanager
 def running_console(deployment: Path, config: ConsoleConfig | None) -> Iterator[None]:
-    """Context manager: serve the web page; a flight continues without it."""
+    """Context manager: serve the web page in a process of its own, which ends with it; nothing if
+    `config` is None. If the page cannot be served, the log says so and the flight continues.
+    """
     ending = threading.Event()
     process = None if config is None else _begun(deployment, config, ending)
     try:

@@ -130,7 +130,7 @@ class _Work:
                 self._timer.start()
 
     def end(self) -> None:
-        """Write that the work is done, if a line was written before."""
+        """Write no more lines."""
         with self._lock:
             self._over = True
             if self._timer is not None:

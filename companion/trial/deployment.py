@@ -21,7 +21,9 @@ _SOURCE, _CONNECTION = "udp://0.0.0.0:5600", "serial:/dev/ttyTHS1:921600"
 
 
 def write_trial_deployment(path: Path, trial: Trial, map_cache: Path) -> Path:
-    """Write the deployment file of camera and map; returns `path`. Comments mark what to check."""
+    """Write the deployment file of camera and map; returns `path`. Comments mark what to check. An
+    earlier one is replaced; `ReportError` if it was changed by hand (`refuse_edited`).
+    """
     settings = _settings(trial, map_cache)
     config = parse_config(settings, str(path))
     text = deployment_text(config, _notes(trial), "companion try")
@@ -54,8 +56,9 @@ def _settings(trial: Trial, map_cache: Path) -> dict[str, Any]:
 def footage_settings(
     map_cache: Path, camera: Camera, mount_deg: Array, *, fixed: bool
 ) -> dict[str, Any]:
-    """Settings of a deployment with this map and camera. mount_deg: (3,) roll, pitch, yaw of the
-    camera, degrees; on the airframe if `fixed`, otherwise on a gimbal.
+    """Settings of a deployment with this map and camera; video source and connection are examples.
+    mount_deg: (3,) roll, pitch, yaw of the camera, degrees; on the airframe if `fixed`, otherwise
+    on a gimbal.
     """
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     angles = {name: round(float(a), 2) for name, a in zip(names, mount_deg, strict=True)}

@@ -57,7 +57,7 @@ class Estimated:
     pixel_sigma: float
 
     @property
-    def frames(self) -> int:
+    def frame_count(self) -> int:
         """Number of frames used."""
         return len(self.poses)
 

@@ -66,7 +66,9 @@ class FrameLocalizer:
         return recorded.load(self._camera, self._loaded * _STEP_NS)
 
     def from_prior(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
-        """Localize from telemetry; an unknown heading or height is searched near the position."""
+        """Localize from telemetry; an unknown heading or height is searched near the position,
+        which takes 10 to 40 s. Raises nothing for an image that cannot be used.
+        """
         if prior.pose is None:
             return Localized(recorded.name, None, problem="has no position")
         try:
@@ -82,7 +84,9 @@ class FrameLocalizer:
         return self._search(recorded.name, frame, prior, region)
 
     def search_map(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
-        """Localize by a search of the whole map, without the frame's position."""
+        """Localize by a search of the whole map, without the frame's position but with its angles
+        and height. Raises nothing for an image that cannot be used.
+        """
         try:
             frame = self.load(recorded)
         except (StreamDecodeError, StreamSizeError, OSError) as error:

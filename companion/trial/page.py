@@ -45,7 +45,9 @@ _TILT_DEG, _FOCAL_PERCENT, _SHIFT_M = 2.0, 2.0, 3.0
 def write_trial(
     folder: Path, trial: Trial, verdict: TrialVerdict, map_cache: Path, say: Say = silent
 ) -> Path:
-    """Write ``report.html``, ``trial.json``, ``frames.csv`` to `folder`; returns the page."""
+    """Write ``report.html``, ``trial.json``, ``frames.csv`` to an existing folder; returns the path
+    of the page. `ReportError` if that fails.
+    """
     with writing(folder, "--report"):
         _write_frames(folder / "frames.csv", trial)
         text = json.dumps(_figures(trial, verdict), indent=1)
@@ -199,7 +201,7 @@ def _estimates(trial: Trial) -> ReportTable:
         i for i, (row, limit) in enumerate(zip(rows, limits, strict=False))
         if row[1] != "not observable" and abs(float(row[1])) > limit
     )  # fmt: skip
-    note = f"By {found.frames} frames, against what was recorded or given."
+    note = f"By {found.frame_count} frames, against what was recorded or given."
     if found.focal_percent is None:
         note += " Over this map focal length and height cannot be separated; the given one is kept."
     elif abs(found.focal_percent) < 3.0 * found.focal_sigma_percent:
@@ -262,7 +264,7 @@ def _figures(trial: Trial, verdict: TrialVerdict) -> dict[str, Any]:
     estimated: dict[str, Any] | None = None
     if found is not None:
         estimated = {
-            "frames": found.frames, "camera": found.camera.to_dict(),
+            "frames": found.frame_count, "camera": found.camera.to_dict(),
             "focal_percent": found.focal_percent,
             "focal_sigma_percent": found.focal_sigma_percent,
             "mount_deg": found.mount_deg.tolist(),
@@ -271,7 +273,7 @@ def _figures(trial: Trial, verdict: TrialVerdict) -> dict[str, Any]:
         }  # fmt: skip
     searched, right, wrong = trial.search_outcome()
     return {
-        "verdict": asdict(verdict), "frames": len(trial.best), "accepted": trial.accepted,
+        "verdict": asdict(verdict), "frames": len(trial.best), "accepted": trial.accepted_count,
         "searched": searched, "found": right, "found_elsewhere": wrong, "estimated": estimated,
         "notes": list(trial.notes), "risk": ProtectionConfig().risk,
     }  # fmt: skip

@@ -87,7 +87,7 @@ class Correction:
     tilt_sigma_deg: float
 
     def applied(self, prior: FramePrior) -> FramePrior:
-        """A corrected copy of the prior."""
+        """A copy of the prior with corrected rotation, position and height, and tilt sigma."""
         rotation = prior.rotation @ self.mount
         pose = prior.pose
         if pose is not None:
@@ -107,7 +107,7 @@ class Ground:
         self._top = float(cache.index.box_max[:, 2].max()) + _ABOVE_M
 
     def height(self, east: float, north: float) -> float | None:
-        """World z of the surface, m, at these map coordinates, m; None outside the map."""
+        """World z of the surface, m, at map coordinates, m; None outside, or if unreadable."""
         down = np.array([[0.0, 0.0, -1.0]])
         try:
             eye = np.array([east, north, self._top])

@@ -65,7 +65,9 @@ def reasons(
     estimated: Estimated | None,
     kind: MapKind | None = None,
 ) -> dict[int, str]:
-    """Likely reason by frame number, for each frame that was not accepted. None: no map figures."""
+    """Likely reason by frame number, for each frame that was not accepted; reads all images if one
+    was not. kind: of the map, None if unknown.
+    """
     failed = [k for k, one in enumerate(localized) if not one.accepted]
     if not failed:
         return {}
@@ -125,7 +127,7 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
 
 
 def map_reason(kind: MapKind | None) -> str:
-    """Reason by the map: why a good image at the right position fails."""
+    """Reason by the map: why a good image at the right position fails. kind: None if unknown."""
     if kind is not None and not kind.has_buildings:
         what = "flat" if kind.heights == "flat" else "bare terrain"
         return f"the map is {what} without buildings and trees; use a surface model, which has them"

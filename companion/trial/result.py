@@ -40,7 +40,7 @@ class Trial:
     notes: tuple[str, ...]
 
     @property
-    def accepted(self) -> int:
+    def accepted_count(self) -> int:
         """Number of frames localized from telemetry, after the correction."""
         return sum(one.accepted for one in self.second)
 

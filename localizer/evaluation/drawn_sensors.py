@@ -23,7 +23,8 @@ from localizer.types import PosePrior
 class DrawnSensors:
     """Errors of the simulated sensors. tilt_sigma_deg: of roll and pitch, per axis; height_sigma_m:
     of the height; None: not measured. by_frame: independent errors for each frame, as for photos;
-    otherwise constant, as a gimbal's and barometer's in a flight.
+    otherwise constant, as a gimbal's and barometer's in a flight. truth, index: a frame's true pose
+    world_from_camera, and its number.
     """
 
     tilt_sigma_deg: float | None = None
@@ -49,7 +50,7 @@ class DrawnSensors:
         return float(truth.translation[2] + self.height_sigma_m * error)
 
     def config(self, config: LocalizerConfig) -> LocalizerConfig:
-        """The localizer's settings with these sigmas."""
+        """The localizer's settings with these sigmas; what is not measured is not used."""
         tilt = self.tilt_sigma_deg
         attitude = None if tilt is None else AttitudePrior.with_sigma(tilt)
         return config.model_copy(
@@ -57,7 +58,7 @@ class DrawnSensors:
         )
 
     def auxiliary(self, sequence: Sequence) -> AuxiliarySensors:
-        """The drawn data in the form that a localizer needs, by the frames' exposure times."""
+        """The drawn data for a localizer, at the frames' exposure times; None at other times."""
         index = {time_ns: k for k, time_ns in enumerate(sequence.times_ns)}
 
         def rotation_at(time_ns: int) -> Array | None:

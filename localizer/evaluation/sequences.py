@@ -43,7 +43,7 @@ class Sequence:
     is_timed: bool = True
 
     def frame(self, index: int) -> Frame:
-        """Decode one frame. `SequenceError` if its size differs from the camera's."""
+        """Decode one frame. `SequenceError` if it cannot be read or has not the camera's size."""
         rgb = read_rgb(self.images[index])
         if rgb.shape[:2] != (self.camera.height, self.camera.width):
             raise SequenceError(
@@ -53,7 +53,7 @@ class Sequence:
         return Frame(rgb, self.times_ns[index], self.camera, index)
 
     def first(self, count: int) -> Sequence:
-        """The first frames of the sequence."""
+        """The sequence's first `count` frames; all if there are fewer."""
         return replace(
             self,
             images=self.images[:count],
@@ -126,9 +126,10 @@ def evaluate(
 
     mode ``first``: only the first frame has a prior, as in the paper; ``each``: every frame starts
     from its own perturbed true pose. passes: number of renderings and registrations of a frame that
-    starts from a perturbed prior, each from the last result. find: gives a prior at the start and
-    when the camera is lost, instead of the perturbed true pose. A frame outside the map or with an
-    unusable image counts as not localized; `OutsideMapError` or `SequenceError` if all frames are.
+    starts from a perturbed prior, each from the last result. progress: called with the index of
+    each frame that is done. find: gives a prior at the start and when the camera is lost, instead
+    of the perturbed true pose. A frame outside the map or with an unusable image counts as not
+    localized; `OutsideMapError` or `SequenceError` if all frames are.
     """
 
     def begin(frame: Frame, index: int) -> bool:

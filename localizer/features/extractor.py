@@ -41,7 +41,9 @@ class FeatureExtractor(Protocol):
         """Network and what runs it, for reports, e.g. ``tiny (onnxruntime, CPU)``."""
 
     def extract(self, rgb: Image) -> FeaturePyramid:
-        """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by 8."""
+        """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by 8 (`ModelError` otherwise).
+        Several threads may call it at a time.
+        """
 
 
 @runtime_checkable
@@ -234,7 +236,9 @@ class OnnxExtractor:
 
 
 def model_key(extractor: FeatureExtractor) -> str:
-    """Key of a model's features; two models may have the same name."""
+    """Key of what computes the features: model, provider, and the weights' hash, because two models
+    may have the same name.
+    """
     if isinstance(extractor, OnnxExtractor):
         return f"{extractor.name} {extractor.info.sha256}"
     return extractor.name

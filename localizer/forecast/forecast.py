@@ -18,7 +18,6 @@ from localizer.registration.backend import level_problems, local_origin
 from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
-from localizer.tracking.motion import mahalanobis_squared
 from localizer.tracking.pipeline import reference_anchors, working_camera
 from localizer.types import Anchors, Image, PosePrior, RegistrationStatus, RenderedView
 
@@ -136,7 +135,7 @@ class Forecaster:
 
     def is_accepted(self, found: Registration, prior: PosePrior) -> bool:
         """Whether a registration would be accepted in flight."""
-        gate = mahalanobis_squared(prior, found.world_from_camera, found.covariance)
+        gate = prior.mahalanobis_squared(found.world_from_camera, found.covariance)
         return is_acceptable(self._config.integrity, found, gate)
 
 

@@ -39,7 +39,7 @@ def lon_near(longitude_deg: float, reference_deg: float) -> float:
 
 
 def geo_box(places: Iterable[tuple[float, float]]) -> GeoBox:
-    """The box of positions (latitude, longitude) less than half the Earth apart."""
+    """The box of one or more positions (latitude, longitude) less than half the Earth apart."""
     latitudes, longitudes = zip(*places, strict=True)
     near = [lon_near(longitude, longitudes[0]) for longitude in longitudes]
     return GeoBox(min(latitudes), wrapped(min(near)), max(latitudes), wrapped(max(near)))

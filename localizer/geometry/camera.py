@@ -63,7 +63,7 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float) -> Camera:
-        """Ideal pinhole with square pixels and the given horizontal field of view."""
+        """Ideal pinhole with square pixels, this field of view, and the axis at the centre."""
         f = 0.5 * width / np.tan(0.5 * np.radians(horizontal_fov_deg))
         return cls(width, height, float(f), float(f), width / 2, height / 2)
 
@@ -73,6 +73,7 @@ class Camera:
         and ``readout_ms``, or of other programs' keys (`localizer.geometry.camera_file`).
 
         `CameraError` for a distortion model that is not supported, and for impossible values.
+        where: begins its text.
         """
         try:
             camera = cls(**camera_numbers(data))
@@ -85,12 +86,12 @@ class Camera:
     @classmethod
     def from_json(cls, path: Path | str) -> Camera:
         """Camera of a ``camera.json`` file, or of another program's file
-        (`camera_file.read_numbers`).
+        (`camera_file.read_numbers`). `CameraError` if it cannot be read, and as `from_dict`.
         """
         return cls.from_dict(read_numbers(Path(path)), str(path))
 
     def to_dict(self) -> dict[str, Any]:
-        """Inverse of `from_dict`."""
+        """Inverse of `from_dict`, as JSON data under this project's keys."""
         return {k: getattr(self, k) for k in KEYS} | {
             "distortion": list(self.distortion), "distortion_model": self.distortion_model,
             "readout_ms": self.readout_ms,
@@ -98,17 +99,17 @@ class Camera:
 
     @property
     def K(self) -> Array:
-        """Calibration matrix (3, 3) in this package's pixel convention."""
+        """Calibration matrix (3, 3); the first pixel's centre is (0.5, 0.5), unlike OpenCV's."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the lens has distortion."""
+        """Whether the lens has distortion; always True for a fisheye."""
         return self.distortion_model != "opencv" or any(k != 0.0 for k in self.distortion)
 
     def is_like(self, other: Camera) -> bool:
         """Whether images of both are interchangeable: focal lengths to 0.1 %, principal
-        points to 0.01 px, size and distortion the same.
+        points to 0.01 px, size and distortion the same. The readout time may differ.
         """
         scales = self.fx / other.fx, self.fy / other.fy
         apart = max(abs(self.cx - other.cx), abs(self.cy - other.cy))
@@ -151,7 +152,8 @@ class Camera:
     def project(self, points: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Points (..., 3) in the camera frame to pixels (..., 2) and a mask of what is in view.
 
-        Points behind the camera give NaN pixels and are not in view.
+        Points behind the camera give NaN pixels and are not in view. Points beyond the angle that
+        the lens shows are not in view either, even if their pixels lie in the image.
         """
         points = np.asarray(points, dtype=np.float64)
         z = points[..., 2]
@@ -172,7 +174,9 @@ class Camera:
         return pixels, inside
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Directions (..., 3) in the camera frame, z = 1, of pixels (..., 2); distortion undone."""
+        """Directions (..., 3) in the camera frame, z = 1 (not unit length), of pixels (..., 2);
+        distortion undone. NaN more than 85 degrees from a fisheye's axis.
+        """
         pixels = np.asarray(pixels, dtype=np.float64)
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy

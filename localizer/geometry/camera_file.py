@@ -62,9 +62,9 @@ _READ = (
 
 
 def read_numbers(path: Path) -> dict[str, Any]:
-    """Parameters of one camera in a file, for `camera_numbers`: JSON, YAML (ROS ``camera_info``,
-    Kalibr's camchain, OpenCV's FileStorage) or COLMAP's ``cameras.txt``. `CameraError` if the file
-    is missing or has none.
+    """Parameters of one camera under the file's own keys, for `camera_numbers`, which checks them.
+    The file is JSON, YAML (ROS ``camera_info``, Kalibr's camchain, OpenCV's FileStorage) or
+    COLMAP's ``cameras.txt``. `CameraError` if it is missing, in no such format, or no mapping.
     """
     try:
         text = plain_text(path)
@@ -87,7 +87,9 @@ def read_numbers(path: Path) -> dict[str, Any]:
 
 
 def camera_numbers(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of `Camera`; ValueError or TypeError for invalid data."""
+    """The arguments of `Camera`, from the keys of this project or another program (module
+    docstring). ValueError or TypeError for invalid data.
+    """
     flat = _flat(data)
     forms = _forms(flat)
     for name in ("camera_matrix", "K", "k", "intrinsics"):

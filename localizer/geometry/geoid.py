@@ -19,7 +19,9 @@ _PER_DEGREE = 4
 
 
 def geoid_separation(latitude_deg: float, longitude_deg: float) -> float:
-    """Height of the EGM96 geoid above the WGS84 ellipsoid, metres."""
+    """Height of the EGM96 geoid above the WGS84 ellipsoid, metres; negative where it is below.
+    Subtract it from an ellipsoidal height for the AMSL height.
+    """
     grid = _egm96()
     y = (np.clip(latitude_deg, -90.0, 90.0) + 90.0) * _PER_DEGREE
     x = ((longitude_deg + 180.0) % 360.0) * _PER_DEGREE

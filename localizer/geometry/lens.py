@@ -56,7 +56,9 @@ def whole_coefficients(model: LensModel, given: tuple[float, ...]) -> tuple[floa
 
 
 def distorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tuple[Array, Array]:
-    """Distorted image coordinates of undistorted ones (x / z, y / z), any shape."""
+    """Distorted image coordinates of undistorted ones (x / z, y / z), any shape. k: the model's
+    coefficients (module docstring).
+    """
     if model == "fisheye":
         r = np.hypot(x, y)
         angle = np.arctan(r)
@@ -76,7 +78,7 @@ def distorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tup
 
 
 def undistorted(model: LensModel, k: tuple[float, ...], x: Array, y: Array) -> tuple[Array, Array]:
-    """Inverse of `distorted`; NaN for a fisheye ray at 90 degrees or more."""
+    """Inverse of `distorted`; NaN for a fisheye ray at more than 85 degrees from the axis."""
     if model == "fisheye":
         r = np.hypot(x, y)
         angle = _fisheye_angle(k, r)

@@ -16,7 +16,7 @@ import numpy as np
 
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, euler_from_matrix, matrix_from_euler
 from localizer.plain_files import plain_text
 
 _OPENCV_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0])
@@ -74,7 +74,9 @@ def _parse(line: str, where: str) -> PoseRow:
 
 
 def write_poses(path: Path | str, rows: Iterable[PoseRow]) -> None:
-    """Write a pose file: 1e-9 degrees of position (0.1 mm), 1e-4 m, 1e-6 degrees of angle."""
+    """Write a pose file into an existing folder, replacing one there. Rounded to 1e-9 degrees of
+    position (0.1 mm), 1e-4 m and 1e-6 degrees of angle. Names must be without blanks.
+    """
     Path(path).write_text("".join(f"{pose_line(row)}\n" for row in rows), encoding="utf-8")
 
 
@@ -88,11 +90,11 @@ def pose_line(row: PoseRow) -> str:
 
 
 def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:
-    """The row's pose in the map's ENU frame."""
+    """The row's pose, OpenCV camera axes to the ENU frame of the map about `frame`'s origin."""
     p = row.position
     centre = frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
     roll, pitch, yaw = np.radians([row.roll_deg, row.pitch_deg, row.yaw_deg])
-    enu_from_opengl = _rz(yaw) @ _ry(roll) @ _rx(pitch)
+    enu_from_opengl = matrix_from_euler(pitch, roll, yaw)  # Rz(yaw) Ry(roll) Rx(pitch)
     return Pose(_map_from_local(p, frame) @ enu_from_opengl @ _OPENCV_FROM_OPENGL, centre)
 
 
@@ -100,27 +102,11 @@ def pose_row(name: str, pose: Pose, frame: LocalFrame) -> PoseRow:
     """The pose file row of a pose world_from_camera; inverse of `world_from_camera`."""
     position = frame.position(pose.translation)
     R = _map_from_local(position, frame).T @ pose.rotation @ _OPENCV_FROM_OPENGL
-    # R = Rz(yaw) Ry(roll) Rx(pitch): the middle angle is roll, from R[2, 0] = -sin(roll).
-    roll = np.arcsin(np.clip(-R[2, 0], -1.0, 1.0))
-    pitch = np.arctan2(R[2, 1], R[2, 2])
-    yaw = np.arctan2(R[1, 0], R[0, 0])
-    angles = np.degrees([roll, pitch, yaw])
-    return PoseRow(name, position, float(angles[0]), float(angles[1]), float(angles[2]))
+    pitch, roll, yaw = (float(angle) for angle in np.degrees(euler_from_matrix(R)))
+    return PoseRow(name, position, roll, pitch, yaw)
 
 
 def _map_from_local(position: Geodetic, frame: LocalFrame) -> Array:
     """Rotation (3, 3) from the tangent plane at `position` to the map's: 0.5 arcmin per km."""
     rotation: Array = frame.ecef_from_enu.rotation.T @ LocalFrame(position).ecef_from_enu.rotation
     return rotation
-
-
-def _rx(a: float) -> Array:
-    return np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-
-
-def _ry(a: float) -> Array:
-    return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-
-
-def _rz(a: float) -> Array:
-    return np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])

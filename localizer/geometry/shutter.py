@@ -35,7 +35,7 @@ class Sweep:
         return cls(np.asarray(rate) * readout_s, np.asarray(velocity) * readout_s)
 
     def displaces_pixels(self, camera: Camera, depth_m: float) -> bool:
-        """Whether the motion displaces points at depth_m in the image."""
+        """Whether the motion displaces a point at depth_m (metres) by more than 0.02 px."""
         angle = float(np.linalg.norm(self.turn) + np.linalg.norm(self.way) / max(depth_m, 1.0))
         return 0.5 * angle * max(camera.fx, camera.fy) > _LEAST_PX
 

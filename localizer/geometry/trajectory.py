@@ -39,8 +39,9 @@ class StampedPose:
 
 
 def write_tum(path: Path, poses: Iterable[StampedPose]) -> None:
-    """Write TUM lines: nanoseconds of time, 0.1 µm of position, 1e-9 of the quaternion.
-    `PoseFileError` if the file cannot be written.
+    """Write TUM lines (ns of time, 0.1 µm of position, 1e-9 of the quaternion) into an existing
+    folder. `PoseFileError` if a pose has no time, and nothing is written then; OSError if the file
+    cannot be written.
     """
     try:
         lines = [f"{tum_line(pose)}\n" for pose in poses]
@@ -60,8 +61,9 @@ def tum_line(pose: StampedPose) -> str:
 
 
 def read_tum(path: Path) -> tuple[StampedPose, ...]:
-    """All poses of a TUM file, named by their time in ns. Blank lines and comments are skipped.
-    `PoseFileError` if the file cannot be read, a line is malformed, or there is no pose.
+    """All poses of a TUM file, named by their time in ns, without covariance. Blank lines and lines
+    that begin with # are skipped. `PoseFileError` if the file cannot be read, a line is malformed,
+    or there is no pose.
     """
     try:
         lines = plain_text(path).splitlines()
@@ -110,7 +112,7 @@ def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
 
 
 def covariance_row(pose: StampedPose) -> tuple[str, ...] | None:
-    """The values of `COVARIANCE_COLUMNS` for a pose; None if its covariance is unknown."""
+    """The texts of `COVARIANCE_COLUMNS`, "" for an unknown time; None without a covariance."""
     if pose.covariance is None:
         return None
     time_ns = "" if pose.time_ns is None else str(pose.time_ns)

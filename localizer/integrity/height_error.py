@@ -120,7 +120,5 @@ class MapHeightError:
         return float(np.sqrt((weight * CANDIDATES_M**2).sum() / weight.sum()))
 
     def updated(self, likelihood: Array) -> MapHeightError:
-        """The posterior after another image of new ground; likelihood: (K,) of
-        `height_likelihood`.
-        """
+        """The posterior after another image of new ground, by its `height_likelihood` (K,)."""
         return replace(self, evidence=_KEPT * self.evidence + _TEMPERED * likelihood)

@@ -44,7 +44,7 @@ class PlaceModel:
 
 @cache
 def place_model(path: Path = MODEL) -> PlaceModel:
-    """Read the fitted model from a file."""
+    """The fitted model of a file, which is read once."""
     data = json.loads(path.read_text(encoding="utf-8"))
     columns = [data["features"][name] for name in FEATURES]
     mean, spread, weights = (
@@ -54,7 +54,8 @@ def place_model(path: Path = MODEL) -> PlaceModel:
 
 
 def place_features(result: Registration) -> Array | None:
-    """Evidence (4,) of a registration, in the order of `FEATURES`; None without patches.
+    """Evidence (4,) of a registration, in the order of `FEATURES`; None after a failure or without
+    patches.
 
     The four values are: quality of the fit; number of patches that match at their own position,
     beyond chance, in sigmas; match of the whole image at its position against the matches beside

@@ -22,7 +22,7 @@ def ground_uncertainty(index: TileIndex, kind: MapKind) -> GroundUncertainty:
     """Uncertainty of the ground height in a map and beyond its edge.
 
     The grade is the root mean square of rise over distance between the lowest points of tiles. A
-    flat map, or one with few tiles, has no grade.
+    flat map, or one with few tiles, tells no grade and gets the default, that of hills.
     """
     missing_m = _MEAN_SHARE * kind.unknown_height_sigma_m
     leaves = np.flatnonzero(index.child_count == 0)

@@ -67,9 +67,10 @@ class TerrainGrid:
 
 
 def open_terrain(path: Path, frame: LocalFrame) -> TerrainGrid:
-    """Read the part of a height GeoTIFF within 20 km of a map's origin.
+    """Read the part of a height GeoTIFF within 20 km of the origin of a map's `frame`. Missing
+    heights there get the median of the others.
 
-    MapSourceError if there is no such raster, no coordinate system, or no height there.
+    `MapSourceError` if there is no such raster, no coordinate system, or no height there.
     """
     with offline():
         try:

@@ -39,7 +39,7 @@ class TerrainModel(Protocol):
     """Heights of the ground: a grid, a plane, or rangefinder readings."""
 
     def height(self, east: Array, north: Array) -> Array:
-        """World z (...) in metres at world places (...)."""
+        """World z in metres at world positions (metres east and north, arrays of one shape)."""
         ...
 
 
@@ -51,7 +51,9 @@ class FlatGround:
 
     @classmethod
     def under(cls, points_world: Array) -> FlatGround:
-        """The ground under surface points (N, 3), e.g. the last anchors that the map gave."""
+        """The ground under surface points (N, 3), e.g. the last anchors that the map gave: 30 % of
+        them are lower, roofs and crowns are higher.
+        """
         return cls(float(np.quantile(points_world[:, 2], _LOW_SHARE)))
 
     def height(self, east: Array, north: Array) -> Array:
@@ -89,13 +91,15 @@ class RangefinderGround:
         self._met: deque[tuple[int, float]] = deque()
 
     def add(self, time_ns: int, height_m: float) -> None:
-        """Add the world z of the surface below at a time."""
+        """Add the world z of the surface below at a time, in the order of time; readings of over 5
+        s before it are dropped.
+        """
         self._met.append((time_ns, height_m))
         while self._met[0][0] < time_ns - _SOUNDED_NS:
             self._met.popleft()
 
     def at(self, time_ns: int) -> FlatGround | None:
-        """The plane from readings up to a time; None with too few."""
+        """The plane from the readings of the 5 s up to a time; None with fewer than 5."""
         heights = [height for t, height in self._met if 0 <= time_ns - t <= _SOUNDED_NS]
         if len(heights) < _LEAST_READINGS:
             return None
@@ -120,7 +124,9 @@ def height_above_ground(
 def ground_points(
     ground: TerrainModel, world_from_camera: Pose, camera: Camera, pixels: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Intersections of pixels' rays (N, 2) with the ground: points (N, 3), and a mask (N,)."""
+    """Intersections of pixels' rays (N, 2) with the ground: points (N, 3), and a mask (N,) of the
+    rays that meet it; the other points are meaningless.
+    """
     rays = camera.rays(pixels) @ world_from_camera.rotation.T
     steep = -rays[:, 2] > _LEAST_DOWN * np.linalg.norm(rays, axis=1)
     down = np.where(steep, rays[:, 2], -1.0)

@@ -11,7 +11,6 @@ import numpy as np
 from localizer.geometry.pose import Array, Pose, hat, quaternion_from_matrix, so3_exp, so3_log
 from localizer.odometry.config import GrowthModel
 from localizer.registration.priors import PoseConstraint
-from localizer.types import PosePrior
 
 
 def transferred(covariance: Array, lever: Array) -> Array:
@@ -34,11 +33,11 @@ def distance_covariance(model: GrowthModel, way_m: float) -> Array:
 
 
 def add_scale_error(known: Array, scale: float, displacement: Array) -> Array:
-    """Covariance (3, 3) of position from scale errors, after another displacement (3,).
+    """Covariance (3, 3) of position from scale errors, after another displacement (3,), m. known:
+    the covariance before it. scale: relative sigma.
 
-    scale: relative sigma. The correlation between the scale errors of two displacements is unknown,
-    so the sum is bounded for any correlation (covariance intersection). It is exact for one scale
-    along a straight line.
+    The correlation between the scale errors of two displacements is unknown, so the sum is bounded
+    for any correlation (covariance intersection). It is exact for one scale along a straight line.
     """
     added = scale * displacement
     before, size = float(np.sqrt(np.trace(known))), float(np.linalg.norm(added))
@@ -150,17 +149,9 @@ def knows_height(constraint: PoseConstraint) -> bool:
     return bool(information[2] > 0 and not information[:2].any())
 
 
-def distance_squared(prior: PosePrior, pose: Pose, covariance: Array) -> float:
-    """Squared Mahalanobis distance (6 dof) of a pose with `covariance` (6, 6) from a prior."""
-    known = prior.world_from_camera
-    difference = np.concatenate(
-        [pose.translation - known.translation, so3_log(pose.rotation @ known.rotation.T)]
-    )
-    return float(difference @ np.linalg.solve(prior.covariance + covariance, difference))
-
-
 def tilt_and_heading(turn: Array) -> Array:
-    """Split a rotation (3, 3) into a small rotation vector (x, y) and one about the vertical (z).
+    """Split a rotation (3, 3) into (3,) rad: a small rotation vector's x and y, and the angle about
+    the vertical.
 
     The heading error of a compass may be large, so the tilt difference is computed without it.
     """

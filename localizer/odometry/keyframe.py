@@ -64,7 +64,7 @@ class Keyframe:
         return add_scale_error(self.scale_covariance, self.scale, hop)
 
 
-def keyframe_anchors(
+def keyframe_anchors(  # noqa: PLR0913
     features: FeaturePyramid,
     camera: Camera,
     world_from_camera: Pose,
@@ -74,11 +74,13 @@ def keyframe_anchors(
     seed: int = 0,
     sweep: Sweep | None = None,
 ) -> tuple[Anchors, DepthSource]:
-    """Anchors of an earlier frame, at most about `count`.
+    """Anchors of an earlier frame, at most about `count`, and MAP if over half of them have their
+    depth from `surface`, otherwise GROUND.
 
     surface: points (N, 3) on the map's surfaces, away from edges: the anchors of the map view that
-    was rendered for this frame. ground: gives points where the map has none. Without both there
-    are no anchors. sweep: the camera's motion during the exposure, see `OdometryFrame`.
+    was rendered for this frame. ground: gives points where the map has none. Without both there are
+    no anchors. sweep: the camera's motion during the exposure, see `OdometryFrame`.
+    `DeviceArrayError` for features in GPU memory.
     """
     _require_host(features)
     rng = np.random.default_rng(seed)

@@ -141,6 +141,7 @@ class VisualOdometry:
         rangefinder.
 
         If the status is not OK, do not use the pose. Once it is LOST, only `begin` helps.
+        `OdometryError` before `begin`, and if nothing gives the first keyframe a depth.
         """
         beginning, track = self._beginning, self._track
         if beginning is None or track is None:

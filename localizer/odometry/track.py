@@ -12,7 +12,6 @@ from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.growth import (
     between,
     distance_covariance,
-    distance_squared,
     fuse,
     kalman_update,
     transferred,
@@ -37,9 +36,7 @@ class OdometryStart:
     constraint: PoseConstraint | None
 
     def corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
-        """The constraint without the sensors' constant error, which is known at the start; None:
-        none.
-        """
+        """The constraint without the sensors' constant error, known at the start; None stays."""
         if constraint is None or self.constraint is None:
             return constraint
         return without_constant_error(constraint, self.constraint, self.pose)
@@ -100,7 +97,8 @@ def rejection(config: OdometryConfig, result: Registration, prior: PosePrior) ->
     sigma = float(np.sqrt(result.covariance.diagonal()[:3].max()))
     if sigma > config.max_sigma_m:
         return f"position sigma {sigma:.1f} m is beyond {config.max_sigma_m:g}"
-    if distance_squared(prior, result.world_from_camera, result.covariance) > config.chi2_threshold:
+    distance = prior.mahalanobis_squared(result.world_from_camera, result.covariance)
+    if distance > config.chi2_threshold:
         return "the pose contradicts the prediction"
     return ""
 

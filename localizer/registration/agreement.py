@@ -52,8 +52,9 @@ class PatchDisplacements:
 
     @property
     def scatter_px(self) -> float:
-        """Sigma of the shifts per axis, level px, by their median. Patches that have changed since
-        the survey have shifts of their own, and the optimizer's loss ignores them.
+        """Sigma of the shifts per axis, level px, by their median; inf without patches. Patches
+        that have changed since the survey have shifts of their own, and the optimizer's loss
+        ignores them.
         """
         if len(self.shift) == 0:
             return np.inf

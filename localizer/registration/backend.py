@@ -100,7 +100,8 @@ class Backend(Protocol):
         settings: LMSettings,
     ) -> Refinement:
         """Run `iterations` LM steps on each of M poses camera_from_local: rotations (M, 3, 3),
-        translations (M, 3). 0 iterations only score them.
+        translations (M, 3), which are not changed. 0 iterations only score them. The scores contain
+        the problem's prior. `BackendError` if a GPU fails.
         """
         ...
 

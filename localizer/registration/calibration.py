@@ -54,6 +54,8 @@ def calibration_covariance(
     parameters' errors are independent. A late timestamp moves the pose along its motion. Patches of
     the map are displaced independently.
 
+    With fewer than 6 points in view, or points that determine no pose, only the timestamp counts.
+
     points_world: (N, 3), the registered points. camera: the pinhole of the registration; sweep: see
     `Sweep`, with the readout of `camera`; moving: velocity (3,), m/s, and angular rate (3,), rad/s,
     world axes.

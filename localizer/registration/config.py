@@ -67,9 +67,7 @@ class JNGOConfig:
         )
 
     def swarm(self, prior: PosePrior, seed: int) -> tuple[Array, Array]:
-        """Rotations (M, 3, 3) and centres (M, 3), world_from_camera, of hypotheses about a
-        prior.
-        """
+        """Rotations (M, 3, 3) and centres (M, 3), world_from_camera, of hypotheses of a prior."""
         return generate_hypotheses(
             prior,
             self.hypotheses,

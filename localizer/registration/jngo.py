@@ -106,8 +106,12 @@ class JNGO:
 
         prior: centre and spread of the swarm. motion: the Kalman prediction for the motion term of
         Eq. 10; None before there is one. constraint: attitude, height or position knowledge
-        (`priors`). Deterministic for a seed. On a GPU the query's features may be `DeviceArray`s.
-        If the GPU fails, the CPU is used from then on, and the log says so.
+        (`priors`); it is ignored if `prior_weight` is 0. Deterministic for a seed. On a GPU the
+        query's features may be `DeviceArray`s.
+
+        A failure is a status of the result, with the prior's pose. ValueError if query or anchors
+        have not the levels of `iterations`. If the GPU fails, the CPU is used from then on, and the
+        log says so; `BackendError` only if this query's features are on the GPU.
         """
         status = _input_status(query, anchors, self.config)
         if status is not RegistrationStatus.OK:

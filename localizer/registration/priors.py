@@ -41,14 +41,16 @@ def attitude_constraint(
 
 
 def height_constraint(height_m: float, sigma_m: float) -> PoseConstraint:
-    """The camera's world z in metres, from the barometer or a rangefinder above known ground."""
+    """The camera's world z in metres (up from the map's origin), from the barometer or a
+    rangefinder above known ground.
+    """
     information = np.zeros((6, 6))
     information[2, 2] = sigma_m**-2
     return PoseConstraint(Pose(np.eye(3), np.array([0.0, 0.0, height_m])), information)
 
 
 def position_constraint(position: Array, covariance: Array) -> PoseConstraint:
-    """The camera's world position (3,) with covariance (3, 3), predicted from the velocity."""
+    """The camera's world position (3,), m, with covariance (3, 3), for example dead reckoning."""
     information = np.zeros((6, 6))
     information[:3, :3] = np.linalg.inv(covariance)
     return PoseConstraint(Pose(np.eye(3), np.asarray(position, dtype=np.float64)), information)

@@ -47,7 +47,8 @@ def subsample_anchors(problem: LevelProblem, count: int) -> LevelProblem:
 def suppress_duplicates(
     problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
 ) -> NDArray[np.int64]:
-    """Indices of finite hypotheses, best first, without near copies of better ones.
+    """Indices of finite hypotheses, best first, without near copies of better ones; the best one
+    alone if none is finite.
 
     R (M, 3, 3), t (M, 3): camera_from_local; totals: (M,) cost. Distance: rms over probe anchors of
     the distance between projections, in pixels of the level. Without this the survivors would be
@@ -81,7 +82,9 @@ def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float3
 
 
 def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:
-    """1 - score / chance score, where chance pairs each anchor with another one's query feature."""
+    """1 - score / chance score, 0 to 1, at a pose camera_from_local; chance pairs each anchor with
+    another one's query feature.
+    """
     query, reference, weights = _sampled(problem, R, t)
     others = np.roll(reference, len(reference) // 2, axis=0)
     actual, _ = robust_loss(np.linalg.norm(query - reference, axis=1), settings)
@@ -90,7 +93,7 @@ def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> 
 
 
 def median_residual(problem: LevelProblem, R: Array, t: Array) -> float:
-    """Weighted median of the residual norms at a pose camera_from_local."""
+    """Weighted median of the residual norms at a pose camera_from_local with anchors in view."""
     query, reference, weights = _sampled(problem, R, t)
     norms = np.linalg.norm(query - reference, axis=1)
     order = np.argsort(norms)

@@ -53,9 +53,7 @@ class FrameShift:
         self._under = self._back(self._ones * self._energy)
 
     def estimate(self, levels: tuple[FeatureLevel, ...]) -> ImageOffset:
-        """The best shift of the frame against a rendering. levels: the rendering's feature
-        pyramid.
-        """
+        """The best shift of the frame against a rendering. levels: its features."""
         features = _weighted(levels[_LEVEL])
         raw = self._back((self._transformed(features) * self._spectrum).sum(axis=2))
         energy = self._transformed((features**2).sum(axis=2))

@@ -17,7 +17,7 @@ _UNFINISHED_S = 86_400.0  # of a process that was cut off; one that writes takes
 
 
 def mark_used(folder: Path) -> None:
-    """Set an overview folder's modification time to now, so that `drop_old` keeps it."""
+    """Set an overview folder's modification time to now if possible: `drop_old` keeps it."""
     try:
         os.utime(folder)
     except OSError:  # a map that is only read keeps what it has
@@ -25,8 +25,8 @@ def mark_used(folder: Path) -> None:
 
 
 def drop_old(folder: Path) -> None:
-    """Remove the overviews beside this folder that were unused for longest, and files of
-    interrupted processes. Other files stay.
+    """Remove all overviews beside this folder but the two used last, and files that a process left
+    unfinished over a day ago. Other files stay; a failure is only logged.
     """
     try:
         for left in folder.glob("*.new"):

@@ -134,7 +134,7 @@ def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
 
 
 def overview_key(cache: TileCache, model: str) -> str:
-    """Key of map, model (`model_key`) and format."""
+    """Key (16 hex digits) of map, model (`model_key`) and format: the overview's folder name."""
     settings = (_FORMAT, GSD_M, STRIDE, CHANNELS, GROUND_CELLS, _QUANTUM)
     text = f"{cache.manifest.index_sha256} {model} {settings}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -87,7 +87,8 @@ def rectify(
     side_px: int,
     gsd_m: float,
 ) -> Patch:
-    """Rectify a pinhole image (H, W, 3) to the square of ground about `centre` (2,).
+    """Rectify a pinhole image (H, W, 3) to the square of ground about `centre` (2,), m east and
+    north of the point below the camera; row 0 is in the north.
 
     rotation: (3, 3) world_from_camera; height_m: above the ground, which is assumed to be flat.
     Ground outside the image gets the image's mean colour.

@@ -48,7 +48,8 @@ class Relocalizer:
 
     extractor: the network without the detail level; coarse: its levels from the overview's stride
     on, in a third of the time. The caller closes all arguments; no other thread may use the
-    renderer. height_sigma_m: RMS of the object heights that the map lacks.
+    renderer. height_sigma_m: RMS of the object heights that the map lacks. should_stop: called
+    all the time; True cancels.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> Relocalization | None:
-        """The candidate that registration confirms; None if it confirms none."""
+        """The candidate that registration confirms; None if it confirms none, or if cancelled."""
         began = time.perf_counter()
         registered = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}
@@ -109,7 +110,9 @@ class Relocalizer:
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> list[PlaceCandidate]:
-        """The most similar positions, best first; empty if cancelled or without any."""
+        """The most similar positions, best first; empty if cancelled, without any, and for a frame
+        without contrast (covered lens).
+        """
         camera = working_camera(query.frame.camera, min(_SEARCH_WIDTH, query.frame.camera.width))
         image = cv2.GaussianBlur(self._undistorted(query, camera), (0, 0), _BLUR_PX)
         if (
@@ -137,7 +140,7 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> list[VerifiedCandidate]:
-        """The registered candidates, best first; the best is refined to the end."""
+        """The registered candidates, best first and refined to the end; empty if cancelled."""
         full, small = self._sights(query)
         return Confirmation(
             self._verifier, full, small, query, candidates, self._config, should_stop
@@ -192,7 +195,8 @@ def open_relocalizer(
     should_stop: Callable[[], bool] = lambda: False,
 ) -> OpenRelocalizer | None:
     """Open a relocalizer with its own renderer and network, so that it and the tracker do not wait
-    for each other. Computes the map's overview if it is missing. None if cancelled.
+    for each other. Computes the map's overview if it is missing, and stores it (`open_overview`,
+    also for its arguments and errors). None if cancelled.
     """
     c = config.relocalization
     streamer = TileStreamer(cache, byte_budget=c.cache_mib * 2**20)

@@ -71,7 +71,7 @@ class Rectification:
     cells: int
 
 
-def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
+def heading_offsets(query: PlaceQuery, config: RelocalizationConfig) -> Array:
     """Rotations (n,) of the query to try, rad counter-clockwise about up: the whole circle if the
     heading is unknown.
     """
@@ -88,7 +88,7 @@ def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
 
 
 def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel:
-    """The finest level at which a patch of `side_m` can be compared."""
+    """The finest level at which a patch of `side_m` can be compared, otherwise the coarsest."""
     for level in levels:
         if side_m / level.gsd_m <= _MOST_PX:
             return level
@@ -115,8 +115,10 @@ def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
     return seen
 
 
-def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> Array:
-    """Heights above ground (n,) to rectify for, so that each position has one near its own."""
+def trial_heights(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> Array:
+    """Heights above ground (n,) in m, ascending, to rectify for, so that each position has one near
+    its own; empty if no ground height is known.
+    """
     known = ground[np.isfinite(ground)]
     if len(known) == 0:
         return np.empty(0)
@@ -169,7 +171,7 @@ def search(
     correlators: of the levels, finest first. A candidate's height is the query's. pool: threads
     that share the work; None: this thread only.
     """
-    heights = scales(query, ground_of(correlators[0].level, query), config)
+    heights = trial_heights(query, ground_of(correlators[0].level, query), config)
     if len(heights) == 0:
         return []
     largest = config.patch_m * max(1.0, float(np.median(heights)) / 120.0)
@@ -181,7 +183,7 @@ def search(
     run = replace(run, blocks=tuple(correlator.blocks(run.cells(float(heights[-1])))))
     run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
     groups = shared_extractions(heights, config.extraction_ratio)
-    turns = headings(query, config)
+    turns = heading_offsets(query, config)
     starts = range(0, len(turns), _HEADINGS_TOGETHER)
     jobs = [(turns[k : k + _HEADINGS_TOGETHER], g) for g in groups for k in starts]
     trials: list[BlockScores] = []

@@ -32,7 +32,7 @@ class SearchRegion:
         return self.centre - reach, self.centre + reach
 
     def contains(self, places: Array) -> NDArray[np.bool_]:
-        """Which of the places (..., 2) lie inside."""
+        """Which of the positions (..., 2), m east and north, lie inside."""
         d = np.asarray(places, np.float64) - self.centre
         inside = np.einsum("...i,ij,...j->...", d, np.linalg.inv(self.shape), d) <= 1.0
         return np.asarray(inside)

@@ -113,7 +113,9 @@ class Verifier:
     def reference(
         self, prior: PosePrior, camera: Camera, extractor: FeatureExtractor | None = None
     ) -> RenderedReference | None:
-        """Render the map at the prior's pose; None if hardly any is in view."""
+        """Render the map at the prior's pose, waiting for its tiles; None if it fills under 10 % of
+        the view. extractor: of its features; None: the one with the detail level.
+        """
         view = self.renderer.render(prior.world_from_camera, camera, wait=True)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
             return None
@@ -130,10 +132,10 @@ class Verifier:
         return Aligned(displaced(prior, away) if near else prior, shift.score)
 
     def register_aligned(
-        self, full: QueryFeatures, place: Aligned, query: PlaceQuery
+        self, full: QueryFeatures, screened: Aligned, query: PlaceQuery
     ) -> tuple[PosePrior, FusedRegistration]:
-        """Align a screened candidate again at full size, and register the frame there."""
-        prior = place.prior
+        """Align a `screen` result again at full size, and register the frame there."""
+        prior = screened.prior
         reference = self.reference(prior, full.camera)
         for _ in range(_ALIGNMENTS):
             if reference is None:
@@ -198,7 +200,7 @@ class Verifier:
         if float(np.linalg.norm(away[:2])) > _FARTHEST_M:
             return False
         if query.heading_sigma_rad is not None:
-            _, heading = tilt_and_heading(result.world_from_camera.rotation, query.rotation)
+            _, heading = attitude_difference(result.world_from_camera.rotation, query.rotation)
             reach = self.config.heading_reach * query.heading_sigma_rad
             if abs(heading) > reach + 3 * _HEADING_SIGMA_RAD:
                 return False
@@ -207,7 +209,7 @@ class Verifier:
 
 def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseConstraint]:
     """Constraints by the query: roll and pitch, at the pose's heading, and the height."""
-    _, heading = tilt_and_heading(pose.rotation, query.rotation)
+    _, heading = attitude_difference(pose.rotation, query.rotation)
     tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
     return (
         attitude_constraint(with_heading(query.rotation, heading), tilt, np.pi),
@@ -216,15 +218,15 @@ def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseCon
 
 
 def displaced(prior: PosePrior, away: Array) -> PosePrior:
-    """A prior displaced by (2,) m to the east and north."""
+    """A prior displaced by `away` (2,), m to the east and north."""
     pose = prior.world_from_camera
     place = pose.translation + np.array([*away, 0.0])
     return replace(prior, world_from_camera=Pose(pose.rotation, place))
 
 
-def tilt_and_heading(rotation: Array, reference: Array) -> tuple[float, float]:
-    """Tilt (rad, >= 0) and rotation about the vertical (rad, counter-clockwise) of a rotation (3,
-    3) world_from_camera relative to a reference.
+def attitude_difference(rotation: Array, reference: Array) -> tuple[float, float]:
+    """(tilt, heading): tilt (rad, >= 0) and rotation about the vertical (rad, counter-clockwise) of
+    a rotation (3, 3) world_from_camera relative to a reference.
     """
     relative = rotation @ reference.T
     # Twist of the swing-twist decomposition: what of the turn is about the vertical.

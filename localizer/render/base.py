@@ -71,10 +71,11 @@ class MapRenderer(Protocol):
         *,
         wait: bool = False,
     ) -> RenderedView:
-        """The view of an ideal pinhole `camera`.
+        """The view of an ideal pinhole `camera`; `CameraError` for a distorted one.
 
         extra: meshes to draw besides the map (moving objects). wait: block until all wanted detail
-        is in memory. The returned arrays belong to the caller.
+        is in memory; otherwise what is in memory is drawn, and missing tiles are loaded for later
+        views. The returned arrays belong to the caller.
         """
         ...
 
@@ -140,9 +141,7 @@ class TileRenderer(ABC):
 
 
 def require_pinhole(camera: Camera) -> None:
-    """`CameraError` if the camera has distortion, which renderers do not support (see
-    `undistortion_maps`).
-    """
+    """`CameraError` if the camera has distortion, which renderers do not support."""
     if camera.is_distorted:
         raise CameraError(
             "the renderer takes an ideal pinhole camera; use camera.without_distortion() and "

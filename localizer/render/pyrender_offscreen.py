@@ -94,7 +94,7 @@ class PyrenderRenderer(TileRenderer):
         folder = Path(self._shaders.name)
         (folder / "flat.vert").write_text(_VERTEX_SHADER)
         (folder / "flat.frag").write_text(_FRAGMENT_SHADER)
-        self._offscreen._renderer = _ExactRenderer(64, 64, str(folder))
+        self._offscreen._renderer = _ExactRenderer(64, 64, str(folder))  # noqa: SLF001
         self.name = "pyrender (OpenGL)"
         self._owner = threading.get_ident()
         self._sky = (*(c / 255 for c in sky), 0.0)  # alpha 0 marks what nothing was drawn on

@@ -33,7 +33,9 @@ class TopView:
 def render_top_view(
     renderer: MapRenderer, centre: Array, side_px: int, gsd_m: float, base_m: float
 ) -> TopView:
-    """Render the square about `centre` (2,) of side_px pixels; base_m: lowest z."""
+    """Render the square about `centre` (2,), world m east and north, of side_px pixels of gsd_m
+    metres; base_m: lowest world z of the map. Waits until all its tiles are read.
+    """
     focal = _EYE_M / gsd_m
     camera = Camera(side_px, side_px, focal, focal, side_px / 2, side_px / 2)
     eye = base_m + _EYE_M

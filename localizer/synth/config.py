@@ -40,7 +40,7 @@ class WorldConfig:
             )
 
     def rng(self, *key: int) -> np.random.Generator:
-        """An independent generator for one part of the world."""
+        """An independent generator for one part of the world; the same one for the same key."""
         return np.random.default_rng([self.seed, *key])
 
     @property

@@ -61,7 +61,7 @@ class WorldInfo:
         return LocalFrame(self.origin)
 
     def save(self, folder: Path) -> None:
-        """Write world.json and the terrain grid."""
+        """Write world.json and the terrain grid to an existing folder."""
         o = self.origin
         document = {
             "format": _FORMAT,
@@ -84,8 +84,8 @@ class WorldInfo:
 
     @classmethod
     def load(cls, folder: Path) -> WorldInfo:
-        """Read what `save` wrote. `MapSourceError` if the file is missing, malformed or of another
-        format.
+        """Read what `save` wrote; the terrain is without its river. `MapSourceError` if a file is
+        missing, malformed or of another format.
         """
         path = Path(folder) / _INFO
         try:
@@ -133,7 +133,8 @@ def build_world(
     look: VisitLook | None = None,
     processes: int = 2,
 ) -> WorldInfo:
-    """Generate a world and write it to the folder `out` as tileset.json, GLB tiles and world.json.
+    """Generate a world and write it to the folder `out` as tileset.json, GLB tiles and world.json;
+    those already there are deleted first.
 
     variant: "survey" is what the map shows, "live" the same place at another visit. config, look:
     replace the defaults of seed, size and variant. processes: number that paint in parallel; more
@@ -150,7 +151,7 @@ def build_visits(
     processes: int = 2,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[WorldInfo]:
-    """Generate several visits to one world, each in its folder; the plan is made once.
+    """Generate visits to one world, each as by `build_world` in its folder; the plan is made once.
 
     progress: called with the share of the work that is done, 0 to 1.
     """

@@ -54,7 +54,7 @@ class TargetFilter:
 
     @property
     def velocity(self) -> Array | None:
-        """Velocity (3,) in m/s, world axes; None before a second observation."""
+        """Velocity (3,), m/s, world, of the most probable track; None before 2 observations."""
         if not self._tracks or self._tracks[0].sightings < 2:
             return None
         velocity: Array = self._tracks[0].mean[3:].copy()
@@ -62,23 +62,25 @@ class TargetFilter:
 
     @property
     def velocity_covariance(self) -> Array | None:
-        """Covariance (3, 3) m²/s² of `velocity`, by the most probable track; None without it."""
+        """Covariance (3, 3) m²/s² of `velocity`, of that track alone; None without it."""
         if self.velocity is None:
             return None
         covariance: Array = self._tracks[0].covariance[3:, 3:].copy()
         return covariance
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
-        """Predicted position (3,) and covariance (3, 3); None before an observation."""
+        """Predicted position (3,), world m, and covariance (3, 3) of the most probable track alone;
+        None before an observation.
+        """
         if not self._tracks:
             return None
         track = _predicted(self._tracks[0], time_ns - self._time_ns)
         return track.mean[:3], track.covariance[:3, :3]
 
     def update(self, sighting: TargetSighting) -> TargetFix | None:
-        """Fuse an observation of at least one surface; None for one that fits no track.
-
-        Three of those restart the filter.
+        """Fuse an observation of at least one surface, later than the last one; None for one that
+        fits no track. The third of those in a row gives a fix again: its surfaces become the
+        tracks.
         """
         tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]
         met = _met(tracks, sighting.surfaces)

@@ -114,7 +114,8 @@ class ImageFollower:
         None if it is not seen or two positions match equally well. A match changes the follower: it
         learns the target's usual score, its course and its present appearance.
 
-        was_hidden: after an occlusion; positions near the expected one are then more likely.
+        gray, estimate: the frame (H, W) and its pose. was_hidden: after an occlusion; positions
+        near the expected one are then more likely.
         """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)
@@ -156,8 +157,9 @@ class ImageFollower:
         """As `find`, for an isolated target: compares the frame with `pictures` of the same ground
         without the target, so that road markings and shadows are not mistaken for it.
 
-        Returns whether the images can decide, and the target. They cannot decide if the target
-        looks like the ground, or is in all images.
+        Returns whether the images can decide, and the target. They cannot decide before `isolate`,
+        with fewer than 3 images that show the place, or if the target looks like the ground or is
+        in most images.
         """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)
@@ -254,23 +256,27 @@ class ImageFollower:
 
     @property
     def is_changed(self) -> bool:
-        """Whether a static target's image changed suddenly and stayed so: it left or is covered."""
+        """Whether, by the frames of `watch`, a static target's image changed suddenly and stayed
+        so: it left or is covered.
+        """
         return self._stands.is_changed
 
     def shows_ground(self, gray: Gray, estimate: PoseEstimate) -> bool:
-        """Whether an isolated target's first position shows the ground: the target left."""
+        """Whether an isolated target's first position shows the ground: the target left. False if
+        it was never isolated, or the position is not in view.
+        """
         chart = self._chart(gray, estimate, self._origin, self._half, course=0.0)
         if chart is None or self._isolated_look is None or self._ground is None:
             return False
         return is_ground(chart, self._ground, self._isolated_look)
 
     def forget_shape(self) -> None:
-        """Undo `isolate`: the target's cells are no longer separated from the ground."""
+        """Undo `isolate` for the search; `shows_ground` still knows the ground and the target."""
         self._mask = self._outline = None
 
     @property
     def is_isolated(self) -> bool:
-        """Whether target and ground cells are separated."""
+        """Whether target and ground cells are separated (`isolate`)."""
         return self._mask is not None
 
     def _turned(self, chart: Grey | None, angle: float) -> Grey | None:

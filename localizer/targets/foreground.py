@@ -70,7 +70,9 @@ class AppearanceCoverage:
 
 
 def is_detectable(ground: Grey, look: TargetAppearance) -> bool:
-    """Whether the target differs enough from the ground (both square) to be detected."""
+    """Whether the target differs enough from the middle of the ground's chart to be detected. Both
+    charts are square; the ground's may be larger.
+    """
     side, size = len(look.grey), len(ground)
     k = (size - side) // 2
     off = (ground[k : k + side, k : k + side] - look.grey) ** 2

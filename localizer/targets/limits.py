@@ -75,7 +75,8 @@ class LastPosition:
 
     def check(self, fix: TargetFix, *, moves: bool) -> TargetRefusal | None:
         """Why a position is rejected; None if it is accepted and becomes the last position. moves:
-        whether the target moves.
+        whether the target may have moved since, at up to 60 m/s; otherwise it may be apart by three
+        sigmas only. Call with every position, in the order of time.
 
         A detector may give the same name to another object. The new position is accepted once it
         was observed for as long as the old one, at most 3 s.

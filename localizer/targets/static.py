@@ -128,7 +128,9 @@ class StaticTarget:
         self.sightings = 0
 
     def update(self, ray: ObservedRay, surfaces: tuple[TargetSurface, ...]) -> bool:
-        """Add an observation of at least one surface; False, unchanged, if it fits none."""
+        """Add an observation of at least one surface. False, unchanged, if its ray passes far from
+        all hypotheses; the first six are never refused.
+        """
         view = _View.of(ray, surfaces)
         if self._hypotheses:
             off = min(_mahalanobis(view, h) for h in self._hypotheses)
@@ -143,18 +145,18 @@ class StaticTarget:
 
     @property
     def residual_ratio(self) -> float:
-        """Squared ratio of the newest residuals to their expected errors, at least 1."""
+        """Mean squared ratio of the six newest residuals to their expected errors, at least 1."""
         n = len(self._recent)
         return max(1.0, sum(self._recent) / (2 * n)) if n else 1.0
 
     @property
     def moves(self) -> bool:
-        """Whether the newest observations show that it moves."""
+        """Whether the six newest observations fit no fixed position: the target moves."""
         n = len(self._recent)
         return n > 0 and sum(self._recent) > 2 * n + 8.0 * np.sqrt(n)
 
-    def places(self) -> tuple[PositionHypothesis, ...]:
-        """The hypotheses: the one with the smallest expected error first, then by weight."""
+    def hypotheses(self) -> tuple[PositionHypothesis, ...]:
+        """All of them (`update` first): that of the smallest expected error, then by weight."""
         logs = np.array([h.log_weight for h in self._hypotheses])
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()

@@ -29,7 +29,7 @@ from localizer.targets.locate import (
     ray_spread,
     surface_covariance,
 )
-from localizer.targets.static import ObservedRay, PositionHypothesis, StaticTarget
+from localizer.targets.static import ObservedRay, StaticTarget
 from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
 
 _STANDS_S = 2.0  # for so long it must agree with standing before it stands again
@@ -63,9 +63,7 @@ class TargetTrack:
     """Track of one target; not thread-safe. refusal: why the last `observe` gave no position."""
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
-        self._id = target_id
-        self._settings = settings
-        self._cast = cast
+        self._id, self._settings, self._cast = target_id, settings, cast
         self._static = StaticTarget(settings.map_sigma_m)
         self._moving = TargetFilter()
         self._moves = False
@@ -78,7 +76,7 @@ class TargetTrack:
 
     @property
     def moves(self) -> bool:
-        """Whether motion was measured."""
+        """Whether motion was measured and it has not stood since for 2 s."""
         return self._moves
 
     @property
@@ -94,7 +92,9 @@ class TargetTrack:
         drift: tuple[float, float] = (0.0, 0.0),
         pixel_sigma: float | None = None,
     ) -> TargetFix | None:
-        """Add the target's pixel in an accepted frame; its position, or None with `refusal` set."""
+        """Add the target's pixel in the next accepted frame; its position, or None with `refusal`
+        set. drift: see `ray_spread`; pixel_sigma: px, None: of the settings.
+        """
         settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
         time_ns, self.refusal = estimate.exposure_time_ns, None
         eye, d = ray_in_world(estimate, pixel)
@@ -152,17 +152,19 @@ class TargetTrack:
         self._last = LastPosition(round(self._settings.confirm_s * 1e9))
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
-        """Predicted position (3,) and covariance (3, 3) at a time; None before the first."""
+        """Predicted position (3,) and covariance (3, 3), common errors not in it; None if
+        unknown.
+        """
         if self._last.fix is None:
             return None
         if self._moves:
             return self._moving.expected(time_ns)
-        best = self._static.places()[0]
+        best = self._static.hypotheses()[0]
         return best.position, best.covariance
 
     def coast(self, estimate: PoseEstimate) -> TargetFix | None:
-        """Predicted position of an unseen moving target; None for a static one, and outside the
-        image or the map.
+        """Predicted position of an unseen moving target, HIDDEN; None for a static one, outside the
+        image or map, or beyond `max_sigma_m`.
         """
         expected = self.expected(estimate.exposure_time_ns) if self._moves else None
         if expected is None:
@@ -180,7 +182,10 @@ class TargetTrack:
         return fix if pixel is not None and is_on_map(fix, self._cast) else None
 
     def hold(self, estimate: PoseEstimate) -> TargetFix | None:
-        """A static target's position in a frame without an observation, by the pose; else None."""
+        """A static target's position in a frame without an observation: HELD where the pose
+        projects it, HIDDEN by the map, or OUTSIDE. None for a moving one and before the first
+        report.
+        """
         if self._moves or self._last.fix is None:
             return None
         fix = self._standing(estimate, None)
@@ -194,9 +199,8 @@ class TargetTrack:
         return replace(fix, pixel=pixel, visibility=seen)
 
     def is_being_hidden(self, estimate: PoseEstimate, position: Array) -> bool:
-        """Whether the map hides a moving target at (3,) now or within half a second.
-
-        Observations of a half hidden target are biased to its visible side.
+        """Whether the map hides a moving target at `position` (3,) now or within half a second:
+        half hidden, observations of it are biased to its visible side.
         """
         velocity = self._moving.velocity
         ahead = position if velocity is None else position + _ENTERS_S * velocity
@@ -209,13 +213,9 @@ class TargetTrack:
         first = float(self._cast(eye, (point - eye)[None] / distance).distances[0])
         return distance - first > max(_HIDDEN_M, beyond_m)
 
-    def places(self) -> tuple[PositionHypothesis, ...]:
-        """Hypotheses of a static target, the reported one first; empty for a moving one."""
-        return self._static.places() if self._last.fix is not None and not self._moves else ()
-
     def _standing(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
         """The position with the smallest expected error; other hypotheses widen its covariance."""
-        places = self._static.places()
+        places = self._static.hypotheses()
         best = places[0]
         eye = estimate.world_from_camera.translation
         bias = self._settings.bias.covariance(best.position - eye)

@@ -51,7 +51,7 @@ class AttitudePrior:
 
     @classmethod
     def with_sigma(cls, sigma_deg: float) -> AttitudePrior:
-        """Roll and pitch with this sigma and without a constant bias."""
+        """Roll and pitch with this sigma (at least 0.05 degrees) and without a constant bias."""
         return cls(max(sigma_deg, _LEAST_SIGMA_DEG), _LEAST_SIGMA_DEG)
 
 
@@ -80,13 +80,15 @@ class AttitudeBias:
 
     @property
     def off_deg(self) -> tuple[float, float]:
-        """The estimated bias: pitch, roll."""
+        """`mean` in degrees: pitch (up positive) and roll (right side down positive) to add to the
+        reported attitude.
+        """
         pitch, roll = np.degrees(self.mean)
         return float(pitch), float(roll)
 
     @property
     def reported_deg(self) -> tuple[float, float, float]:
-        """Rounded bias (pitch, roll) and sigma after correction, degrees, for health reports."""
+        """Rounded `off_deg` (pitch, roll) and `sigma_rad` in degrees, for health reports."""
         pitch, roll, sigma = (
             round(float(v), 2) for v in (*self.off_deg, np.degrees(self.sigma_rad))
         )
@@ -100,8 +102,8 @@ def initial_bias(config: AttitudePrior) -> AttitudeBias:
 
 
 def horizontal_axes(rotation: Array) -> Array | None:
-    """(3, 2) unit vectors in the world: to the right of a camera with rotation (3, 3), and ahead of
-    it. None if it is rolled on its side.
+    """(3, 2) horizontal unit vectors in the world: to a camera's right, and ahead of it. rotation:
+    its world_from_camera (3, 3). None if it is rolled on its side.
     """
     right = np.array([rotation[0, 0], rotation[1, 0], 0.0])
     length = float(np.hypot(right[0], right[1]))
@@ -138,13 +140,18 @@ class AttitudeObservation:
 
 
 def is_new_ground(bias: AttitudeBias, place: Array, distance_m: float) -> bool:
-    """Whether the position `place` (3,) is independent: errors repeat over the same ground."""
+    """Whether an observation from the position `place` (3,), world m, is independent of the last
+    one: at least 20 m from it, and half of `distance_m`, the distance to the ground in view. Over
+    the same ground, errors repeat.
+    """
     apart_m = max(_LEAST_APART_M, _APART * distance_m)
     return bias.place is None or bool(np.hypot(*(place[:2] - bias.place)) >= apart_m)
 
 
 def without_observation(bias: AttitudeBias, place: Array, time_ns: int) -> AttitudeBias:
-    """The bias after uninformative ground at `place` (3,): its covariance grows with time."""
+    """The bias after uninformative ground at `place` (3,), world m, which then counts as the place
+    of the last observation. The covariance grows with the time since the one before.
+    """
     apart_s = abs(time_ns - bias.time_ns) * 1e-9 if bias.place is not None else 0.0
     walked = np.eye(2) * _WALK_RAD**2 * min(apart_s, 60.0)
     covariance = bias.covariance + walked
@@ -155,7 +162,9 @@ def with_observation(
     bias: AttitudeBias, config: AttitudePrior, reported: Array, observation: AttitudeObservation
 ) -> AttitudeBias:
     """The bias after another observation. reported: rotation (3, 3) world_from_camera by the
-    sensors.
+    sensors, of the observation's time. An observation more than 4 sigmas off is refused; the fifth
+    refusal in a row resets the bias to `initial_bias`. An observation too uncertain to count only
+    sets place and time; a camera rolled on its side changes nothing.
     """
     axes = horizontal_axes(reported)
     if axes is None:

@@ -105,7 +105,10 @@ class DeadReckoning:
         self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array,
         sweep: Sweep | None = None,
     ) -> None:  # fmt: skip
-        """Start, or start again, from a frame that the map located. velocity: (3,) m/s, world."""
+        """Start, or start again, from a frame that the map located, with its features (query), the
+        anchors of its reference, and the camera's velocity (3,) m/s, world axes. sweep: the
+        camera's motion during the readout; None: global shutter.
+        """
         camera = with_field_of_view(self._pinhole, estimate.camera)
         frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
         self._odometry.begin(
@@ -121,8 +124,10 @@ class DeadReckoning:
         self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None,
         sweep: Sweep | None = None,
     ) -> PropagatedPose:  # fmt: skip
-        """Propagate the pose to a frame. prediction: the motion model's; anchors: of the reference
-        at the prediction, None without one.
+        """Propagate the pose to a frame with features `query`; NONE without a start pose.
+        prediction: the motion model's; anchors: of the reference at the prediction, None without
+        one, as beyond the map's edge; sweep: as `begin`. BROKEN drops the start pose: NONE follows
+        until `begin`.
         """
         if not self._odometry.ready:
             return _NOTHING

@@ -59,9 +59,10 @@ class DualThreadEngine:
     Above 200 lines: a few lines for each cycle of each thread, and all share one state.
 
     subscribers: called on the localization thread with every estimate; they must not block.
-    prior_provider: called with a time in ns for an external pose if there is none or tracking is
-    LOST. searcher: finds a position without a prior, on its own thread. If it shows no progress for
-    two minutes, the hang is reported and frames no longer wait for it. clock: CLOCK_MONOTONIC, ns.
+    prior_provider: called there with a time in ns for an external pose if there is none or tracking
+    is LOST. searcher: finds a position without a prior, on its own thread. If it shows no progress
+    for two minutes, the hang is reported and frames no longer wait for it. clock: CLOCK_MONOTONIC,
+    ns.
     """
 
     def __init__(
@@ -101,12 +102,14 @@ class DualThreadEngine:
             self._threads.append(self._thread("search", self._search_once))
 
     def start(self) -> None:
-        """Start the threads."""
+        """Start the threads; once in an engine's life."""
         for thread in self._threads:
             thread.start()
 
     def stop(self) -> None:
-        """Stop the threads and wait for them with a time limit."""
+        """Stop the threads and wait for each, at most 20 s (the search 10 s); one that does not end
+        is logged and left behind. The localizer stays open.
+        """
         self._stop.set()
         self._ahead.close()
         self._render_times.close()
@@ -135,7 +138,9 @@ class DualThreadEngine:
         )
 
     def last_ticks_ns(self) -> dict[str, int]:
-        """Start of each thread's newest cycle, CLOCK_MONOTONIC ns, by name."""
+        """Start of the newest cycle, CLOCK_MONOTONIC ns, of the threads "render", "extract" and
+        "localize" that have begun. The search is left out, because a cycle of it takes minutes.
+        """
         return {n: self._last_ticks[n] for n in _FIX_THREADS if n in self._last_ticks}
 
     def _thread(self, name: str, once: Callable[[], None]) -> threading.Thread:

@@ -77,7 +77,7 @@ class HealthCounters:
             self._health = replace(self._health, searching=searching, search_hangs=False)
 
     def set_search_hangs(self, hangs: bool) -> None:
-        """Set whether the running search no longer responds."""
+        """Set whether the running search no longer responds; its beginning is logged."""
         with self._lock:
             news = hangs and not self._health.search_hangs
             self._health = replace(self._health, search_hangs=hangs)
@@ -85,7 +85,9 @@ class HealthCounters:
             _log.error("the search for a place does not answer: the flight goes on without it")
 
     def report(self, error: Exception) -> None:
-        """Set this thread's error, until the thread works again."""
+        """Set the calling thread's error until its `clear_error`, count it, and log it, at most one
+        error in 5 s.
+        """
         with self._lock:
             self._errors[threading.current_thread().name] = error
         self.count(errors=1)
@@ -95,7 +97,7 @@ class HealthCounters:
             _log.warning("%s", _text(error))
 
     def clear_error(self) -> None:
-        """This thread works again: clear its error, but no other thread's."""
+        """The calling thread works again: clear its error, but no other thread's."""
         with self._lock:
             self._errors.pop(threading.current_thread().name, None)
 

@@ -42,9 +42,10 @@ class Mailbox(Generic[T]):
             return True
 
     def take(self, timeout_s: float | None = None) -> T | None:
-        """Remove and return the item; waits for one. None after the timeout or once closed.
+        """Remove and return the item; waits for one, without a timeout for ever. None after the
+        timeout, or once closed, even if an item waits.
 
-        Raises the error that `close` was given.
+        Raises the error that `close` was given, at every call.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None or self._closed, timeout_s)
@@ -56,9 +57,7 @@ class Mailbox(Generic[T]):
             return item
 
     def close(self, error: Exception | None = None) -> None:
-        """End the mailbox and wake the consumer, with an error or none. Only the first call
-        counts.
-        """
+        """End it, and wake the consumer with an error or none. Only the first call counts."""
         with self._changed:
             if self._closed:
                 return

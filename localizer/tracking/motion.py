@@ -75,7 +75,9 @@ class MotionState:
 
 
 def start(prior: PosePrior, config: MotionConfig) -> MotionState:
-    """Filter state from a prior. Without a velocity in the prior, the velocity is unknown."""
+    """Filter state from a prior, at its time. Without a velocity in the prior, the velocity is
+    unknown; the angular rate always is.
+    """
     mean = np.zeros(12)
     mean[:3] = prior.world_from_camera.translation
     known = prior.velocity is not None
@@ -128,7 +130,7 @@ def update(ahead: MotionState, pose: Pose, covariance: Array) -> MotionState:
 
 
 def inflate(state: MotionState, config: MotionConfig) -> MotionState:
-    """The state with sigmas enlarged up to twofold (up to those of a search), after a registration
+    """The state with sigmas doubled, to at most those of a search, after a registration
     of good quality was rejected by it. If the vehicle manoeuvred, one of the next frames is then
     accepted. A wrong registration would have to be wrong in the same way again.
     """
@@ -137,36 +139,24 @@ def inflate(state: MotionState, config: MotionConfig) -> MotionState:
     return replace(state, covariance=state.covariance * np.outer(scale, scale))
 
 
-def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0) -> float:
-    """Squared Mahalanobis distance of `pose` from `prior`, 6 degrees of freedom.
-
-    extra: covariance (6, 6) of the pose itself, added to the prior's.
-    """
-    delta = pose_difference(prior.world_from_camera, pose)
-    S = prior.covariance + extra
-    return float(delta @ np.linalg.solve(S, delta))
-
-
-def place_sigma_m(prior: PosePrior) -> float:
-    """Largest horizontal sigma of a prior's position."""
+def horizontal_sigma_m(prior: PosePrior) -> float:
+    """Sigma of a prior's position along the worst horizontal direction, metres."""
     return float(np.sqrt(max(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1], 0.0)))
 
 
 def is_beyond_capture(prior: PosePrior) -> bool:
-    """Whether a prediction is too uncertain for a registration to converge."""
+    """Whether a prediction is too uncertain for a registration to converge: a horizontal sigma of
+    10 m or a rotation sigma of 8 degrees.
+    """
     turn = float(np.sqrt(prior.covariance.diagonal()[3:].max()))
-    return place_sigma_m(prior) >= _FULL * _MAX_SIGMA_M or turn >= _FULL * _MAX_SIGMA_RAD
-
-
-def pose_difference(a: Pose, b: Pose) -> Array:
-    """``b - a`` as (position, left rotation vector), shape (6,), world axes."""
-    return np.concatenate([b.translation - a.translation, so3_log(b.rotation @ a.rotation.T)])
+    return horizontal_sigma_m(prior) >= _FULL * _MAX_SIGMA_M or turn >= _FULL * _MAX_SIGMA_RAD
 
 
 def reset_motion(
     state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None
 ) -> MotionState:
-    """The state's pose at another time with the sigmas of a search and unknown motion.
+    """The state's pose at another time with the sigmas of a search (10 m, 8 degrees) and unknown
+    motion.
 
     Used for a camera whose clock jumped: its frames are consecutive, their times are not. turn: as
     in `predict`; None: the rotation is kept.
@@ -200,7 +190,7 @@ class MeasuredMotion:
         self._config, self._rotation_at = config, rotation_at
 
     def predict(self, state: MotionState, time_ns: int) -> MotionState:
-        """Predict the state at `time_ns`."""
+        """`predict` with the rotation that was measured in between, if any."""
         turn = self._turn(state.time_ns, time_ns)
         return predict(state, time_ns, self._config, turn)
 

@@ -53,8 +53,8 @@ def open_localizer(
 
     map_cache: folder made by `build_cache` (``companion map build``). camera: of the frames as they
     arrive, with distortion. config: every setting has a default. sensors: see `Localizer`. The
-    first call on a machine compiles for a minute. Use it on the thread that opened it, because a
-    GPU's renderer belongs to that thread.
+    first call on a machine compiles for a minute. Any thread may use it, one at a time. Raises
+    `LocalizerError`, such as `MapCacheError`.
     """
     config = config or LocalizerConfig()
     stack = MapStack(Path(map_cache), config)
@@ -73,9 +73,8 @@ def build_localizer(
     *,
     on_close: Callable[[], None] = lambda: None,
 ) -> Localizer:
-    """A localizer for one camera over an open map, which stays the caller's to close.
-
-    sensors, on_close: see `Localizer`.
+    """A localizer for one camera over an open map. The caller closes the map, after the localizer,
+    unless on_close does. sensors, on_close: see `Localizer`.
     """
     size = working_camera(camera, config.width)
     features = load_extractor(

@@ -105,7 +105,9 @@ class Undistorter:
         return inside if inside.mean() < _NEARLY_ALL else None
 
     def __call__(self, frame: Frame) -> Image:
-        """The frame's image (height, width, 3) uint8 at the target's size."""
+        """The frame's image (height, width, 3) uint8 at the target's size. `CameraError` if the
+        image has not the source camera's size.
+        """
         height, width = frame.image.shape[:2]
         if (width, height) != (self.source.width, self.source.height):
             raise CameraError(
@@ -164,7 +166,7 @@ class Localizer:
     is_loading: whether requested tiles are still loading.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         renderer: MapRenderer,
         extractor: FeatureExtractor,
@@ -270,7 +272,9 @@ class Localizer:
         return self._renderer.name
 
     def set_prior(self, prior: PosePrior) -> None:
-        """Start (again) from an external pose, for example the autopilot's."""
+        """Start (again) from an external pose, for example the autopilot's: the state becomes
+        INITIALIZING, and the motion is the prior's.
+        """
         self._tracker.set_prior(prior)
 
     def offer(self, prior: PosePrior) -> None:
@@ -286,7 +290,8 @@ class Localizer:
     def propose(self, prior: PosePrior) -> None:
         """Start a tentative track; its pose is used once confirmed (`localizer.integrity`).
 
-        The state does not change: a tentative track does not end LOST.
+        The motion is the prior's from now on. The state does not change: a tentative track does not
+        end LOST.
         """
         self._tracker.propose(prior)
 
@@ -298,11 +303,13 @@ class Localizer:
         query: Callable[[], FeaturePyramid] | None = None,
     ) -> PoseEstimate:
         """Localize one frame on this thread: predict, render the reference, extract, register.
+        Waits until the map's tiles in view are read.
 
-        passes: number of renderings and registrations, each from the last result; use 3 for a
-        prior that is metres and degrees off. query: returns the frame's features
-        (`extract_query`) if they are computed in parallel. Raises `OutsideMapError` without a
-        prior (`set_prior`), or if the predicted view does not meet the map.
+        passes: number of renderings and registrations, each from the last result; use 3 for a prior
+        that is metres and degrees off. query: returns the frame's features (`extract_query`) if
+        they are computed in parallel. Raises `OutsideMapError` without a prior (`set_prior`), or if
+        the predicted view does not meet the map, and `CameraError` if the image has not its
+        camera's size.
         """
         stage_ms: dict[str, float] = {}
         features: FeaturePyramid | None = None
@@ -348,7 +355,10 @@ class Localizer:
     def reference_for(
         self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
     ) -> ReferenceBundle:
-        """The last reference while it is usable (`reference_shift_px`), otherwise a new one."""
+        """`last` while it is usable (`reference_shift_px`), otherwise a new one (`make_reference`),
+        which may be rendered up to 0.2 s ahead of the prior. last: None before the first. wait, and
+        errors: as `make_reference`.
+        """
         track_status = self.tracker.track_status
         holds = track_status.state is TrackingState.TRACKING and track_status.rejected_in_row == 0
         steady = holds and not self._is_loading()
@@ -397,7 +407,10 @@ class Localizer:
         self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
-        """Features of the frame. They do not need the reference, so this may run in parallel."""
+        """Features of the frame, undistorted. They do not need the reference, so this may run in
+        parallel, on one thread at a time: it sets `camera`, and adapts to another lens or zoom.
+        `CameraError` if the image has not its camera's size.
+        """
         undistorter, camera = self._undistorter, with_field_of_view(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom

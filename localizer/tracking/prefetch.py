@@ -110,7 +110,9 @@ class FeaturePrefetcher:
         return PrefetchedFrame(frame, features, 1e3 * spent_s)
 
     def take(self, timeout_s: float) -> PrefetchedFrame | None:
-        """The next frame, waiting for one; None after the timeout or once closed."""
+        """The next frame, waiting for one; None after the timeout or once closed. The call also
+        says that the registration of the frame before has ended.
+        """
         if not self._waits.is_set():
             if self._taken_s:
                 self._pace.add_registration(time.monotonic() - self._taken_s)
@@ -123,7 +125,7 @@ class FeaturePrefetcher:
         return prepared
 
     def close(self) -> None:
-        """Wake both threads and end."""
+        """Wake both threads and end; a frame that waits is dropped."""
         self._frames.close()
         self._prepared.close()
         self._wanted.set()

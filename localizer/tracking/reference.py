@@ -18,7 +18,8 @@ def is_still_valid(
     bundle: ReferenceBundle, pose: Pose, camera: Camera, time_ns: int, most_px: float
 ) -> bool:
     """Whether a camera at `pose` sees 95 % of the reference's anchors within `most_px` of their
-    pixels in the reference.
+    pixels in the reference. False for a reference of over 1 s before or any time after `time_ns`,
+    for under 16 anchors, and if `most_px` is 0.
 
     camera: the present pinhole, which may have zoomed. Anchors are map points, so the registration
     works from any viewpoint from which they look similar and are in view.
@@ -35,8 +36,8 @@ def lead_share(
     """Share (0 to 1) of the path from `pose` to `later` at which to render the next reference.
 
     A reference that is rendered ahead, and is already valid now, is valid nearly twice as long. If
-    it would be valid for a single frame only, it is rendered at that frame's pose. frame: share of
-    the path between two frames.
+    it would be valid for a single frame only, it is rendered at that frame's pose (0). frame: the
+    share of the path that the camera moves from one frame to the next.
     """
     camera = bundle.view.camera
     apart = _apart_px(bundle, (pose, camera), (later, camera))

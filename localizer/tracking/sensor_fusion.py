@@ -46,8 +46,9 @@ class FusedRegistration:
 
 
 def with_map_error(result: Registration, height_sigma_m: float) -> Registration:
-    """The registration with the covariance from its image patches and the map's height error;
-    unchanged without patches. height_sigma_m: RMS of the heights that the map lacks.
+    """The registration with the covariance from its image patches and the map's height error; its
+    own covariance becomes `noise`. NO_TEXTURE if the patches determine no covariance; unchanged
+    without patches or if not OK. height_sigma_m: RMS of the heights that the map lacks.
     """
     votes = result.agreement
     if result.status is not RegistrationStatus.OK or votes is None:
@@ -66,7 +67,9 @@ def with_map_error(result: Registration, height_sigma_m: float) -> Registration:
 def fused_registration(
     result: Registration, constraints: Iterable[PoseConstraint]
 ) -> FusedRegistration:
-    """Fuse the registration with the other sensors, one after another."""
+    """Fuse the registration with the other sensors, one after another; a constraint 4 sigmas away
+    is ignored and noted. A registration that is not OK stays as it is.
+    """
     if result.status is not RegistrationStatus.OK:
         return FusedRegistration(result)
     pose, covariance, contradicted = result.world_from_camera, result.covariance, False
@@ -100,7 +103,9 @@ class SensorFusion:
         self._is_surface = map_kind is not None and map_kind.has_buildings
 
     def fuse(self, result: Registration, time_ns: int) -> FusedRegistration:
-        """Fuse a frame's registration with attitude and height at `time_ns`."""
+        """Fuse a frame's registration with attitude and height at `time_ns`, after widening it by
+        the map's error (`with_map_error`).
+        """
         known = self._constraints(result.world_from_camera, time_ns)
         return fused_registration(self._with_map_error(result), known)
 
@@ -108,20 +113,21 @@ class SensorFusion:
         return with_map_error(result, self.height_error.sigma_m)
 
     def learn(
-        self, result: Registration, place: Pose, unknown: Array, distance_m: float, time_ns: int
+        self, result: Registration, pose: Pose, unknown: Array, distance_m: float, time_ns: int
     ) -> None:
         """Update attitude bias and height error with an accepted frame, if it shows new ground.
+        Does nothing if the attitude is not used.
 
-        result: its registration before `fuse`; place: the accepted pose; unknown: (6, 6) covariance
+        result: its registration before `fuse`; pose: the accepted pose; unknown: (6, 6) covariance
         of the errors of map and camera model; distance_m: to the ground in view.
         """
-        if not self.attitude_bias.is_due(place.translation, distance_m):
+        if not self.attitude_bias.is_due(pose.translation, distance_m):
             return
         votes = result.agreement
         if votes is not None and votes.displacements is not None:
             # A gimbal that sinks looks like missing buildings. Over a surface model it would make
             # the pose less sure and pull it along, so there the image alone is heard.
-            known = [] if self._is_surface else self._constraints(place, time_ns)
+            known = [] if self._is_surface else self._constraints(pose, time_ns)
             likelihood = height_likelihood(
                 votes.displacements, result.world_from_camera, combine(*known) if known else None
             )
@@ -129,7 +135,7 @@ class SensorFusion:
                 self.height_error = self.height_error.updated(likelihood)
         seen = self._with_map_error(result)
         if seen.status is not RegistrationStatus.OK:
-            self.attitude_bias.skip_ground(place.translation, time_ns)
+            self.attitude_bias.skip_ground(pose.translation, time_ns)
             return
         self.attitude_bias.learn(
             AttitudeObservation(
@@ -151,5 +157,5 @@ class SensorFusion:
 
 
 def distance_m(points_world: Array, place: Array) -> float:
-    """Distance from `place` (3,) to the centroid of points (N, 3) in view, at least 1 m."""
+    """Distance from `place` (3,) to the centroid of points (N, 3), both world m; at least 1 m."""
     return max(float(np.linalg.norm(points_world.mean(axis=0) - place)), 1.0)

@@ -47,13 +47,13 @@ class TrackStatus:
 
     @property
     def wants_prior(self) -> bool:
-        """Whether an external pose is better than the prediction: before the first acceptance, and
-        when LOST without a tentative track.
+        """Whether an external pose is better than the prediction: while INITIALIZING or LOST,
+        unless the newest registration was accepted.
         """
         return self.state not in _SEES and self.accepted_in_row == 0
 
     def restarted(self) -> TrackStatus:
-        """The status after a start from a known pose."""
+        """The status after a start from a known pose: as at first, but `last_fix_ns` stays."""
         return TrackStatus(last_fix_ns=self.last_fix_ns)
 
     def proposed(self, independent: bool) -> TrackStatus:

@@ -51,7 +51,7 @@ class Tracker:
     """Tests registrations, filters the motion, and propagates the pose without the map.
 
     `update` belongs to the localization thread; other methods may be called from any thread.
-    dead_reckoning: None if features are not in host memory.
+    dead_reckoning: None: without odometry.
     """
 
     def __init__(
@@ -75,13 +75,13 @@ class Tracker:
             return self._state
 
     def set_prior(self, prior: PosePrior) -> None:
-        """Start (again) from an external pose."""
+        """Start (again) from an external pose: INITIALIZING, with the prior's motion."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
             self._state = TrackerState(state, self._state.track_status.restarted())
 
     def propose(self, prior: PosePrior) -> None:
-        """Start a tentative track; the state does not change."""
+        """Start a tentative track with the prior's motion; the `TrackingState` does not change."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
             self._state = TrackerState(state, self._state.track_status.proposed(prior.independent))
@@ -114,10 +114,12 @@ class Tracker:
         anchors: Anchors | None,
         fused: FusedRegistration | None,
     ) -> PoseEstimate:
-        """Test a registration, and update motion and track status.
+        """Test a registration, update motion and track status, and run the odometry: it restarts at
+        an accepted frame and propagates the pose over a rejected one.
 
-        seen, ahead: the state and its motion at the frame, from which the registration started.
-        anchors, fused: None without a reference view.
+        seen, ahead: the state and its motion at the frame, from which the registration started; if
+        an external prior has replaced that state since, the new motion and status are dropped.
+        query: the frame's features. anchors, fused: None without a reference view.
         """
         result = None if fused is None else fused.registration
         acceptable = result is not None and self._is_acceptable(result, ahead.prior)
@@ -162,8 +164,8 @@ class Tracker:
 
     def _is_acceptable(self, result: Registration, prior: PosePrior) -> bool:
         # Also before tracking: the gate is against the prior's own covariance, which is wide then.
-        distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
-        sigma_m = motion.place_sigma_m(prior)
+        distance = prior.mahalanobis_squared(result.world_from_camera, result.covariance)
+        sigma_m = motion.horizontal_sigma_m(prior)
         return is_acceptable(self._config.integrity, result, distance, sigma_m)
 
     def _carry(

@@ -92,14 +92,6 @@ def export(
     )
 
 
-@app.command()
-def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -> None:
-    """Plot a run's metrics beside its CSV."""
-    from localizer.training.loop.curves import plot
-
-    typer.echo(plot(log))
-
-
 @app.command("contact-sheet")
 def contact_sheet_of(
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to show pairs of.")],

@@ -34,7 +34,9 @@ class _Frozen(BaseModel):
 
 
 class _PlacesSection(_Frozen):
-    """Keys of the places and visits of both kinds of data. workers: processes that make places."""
+    """Keys of the places and visits of both kinds of data. workers: processes that make places; of
+    live pairs also the threads that render them.
+    """
 
     first_seed: int = Field(ge=1000, lt=2**31)
     scenes: int = Field(gt=0, lt=2**31)

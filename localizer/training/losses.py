@@ -99,7 +99,10 @@ def lm_step(
     K: Tensor,
     damping: float = 0.05,
 ) -> Tensor:
-    """One differentiable Levenberg-Marquardt step of the feature-metric cost (paper, Eqs. 6-9)."""
+    """One differentiable Levenberg-Marquardt step of the feature-metric cost (paper, Eqs. 6-9) from
+    query_from_reference `pose`; returns the next. reference, query: as of `alignment_loss`; K: (B,
+    4) of the level.
+    """
     features, confidence = query
     h, w = features.shape[2:]
     pixels, local = project(pose, points, K)

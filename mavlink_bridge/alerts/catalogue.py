@@ -51,13 +51,13 @@ def reason(of: Alert) -> str:
 
 
 def values_by_name(of: Alert) -> dict[str, Value | str]:
-    """The alert's values by name; a value that is another alert as its title."""
+    """The alert's values by name, {} for a cleared one; a value that is an alert as its title."""
     shown = (CATALOGUE[v].title if isinstance(v, AlertId) else v for v in of.values)
     return dict(zip(spec_of(of).values, shown, strict=True)) if of.active else {}
 
 
 def text(of: Alert) -> str:
-    """The STATUSTEXT of an alert, with the prefix."""
+    """The STATUSTEXT, with the prefix and not cut; of a cleared alert, the text of its end."""
     spec = spec_of(of)
     if of.active:
         return spec.template.format(**values_by_name(of))

@@ -121,11 +121,13 @@ class CameraComponent:
             self._sent_ns.pop((kind, target_id), None)
 
     def report_view(self, view: CameraView) -> None:
-        """Set the newest camera pose, to be sent by `tick`."""
+        """Set the newest camera pose, to be sent once by `tick`."""
         self._view = view
 
     def tick(self, now_ns: int, vehicle: Origin | None, uptime_ms: int, send: Send) -> None:
-        """Send the messages that are due. vehicle: its position, None if unknown."""
+        """Send the messages that are due, after dropping targets whose report is over 2 s old.
+        vehicle: its position, for the targets' distance; None if unknown.
+        """
         for target_id in [
             i for i, t in self._targets.items() if abs(now_ns - t.time_ns) > _TARGET_AGE_NS
         ]:
@@ -177,7 +179,7 @@ class CameraComponent:
         return due
 
     def command(self, message: Any, time_ns: int, uptime_ms: int, send: Send) -> bool:
-        """Answer a COMMAND_LONG to the camera; False if it is for another component."""
+        """Execute and answer a command to the camera; False, and nothing is done, for others."""
         if message.target_component != self._component:
             return False
         result, number = self._execute(message, time_ns, uptime_ms, send), 0

@@ -46,11 +46,11 @@ class CursorOnTarget:
         self._next_ns = 0
 
     def send(self, target: TargetReport) -> None:
-        """Send a target's event; events that the network refuses are lost."""
+        """Send a target's event, or lose it. May block to resolve a name in `cot_endpoint`."""
         self._write(cursor_on_target(target, self._config, self._utc))
 
     def report_view(self, view: CameraView) -> None:
-        """Send aircraft and camera, at most once a second, if `cot_aircraft` is set."""
+        """Send aircraft and camera if `cot_aircraft` is set, at most every 0.9 s."""
         if not self._config.cot_aircraft:
             return
         with self._lock:
@@ -129,7 +129,10 @@ def aircraft_on_map(
 
 
 def sensor_angles(quaternion_ned: quat.Quaternion) -> tuple[float, float, float]:
-    """Azimuth from true north, elevation and roll of a camera (x along the boresight), degrees."""
+    """Azimuth from true north, elevation (up positive) and roll of a camera, degrees.
+    quaternion_ned: camera (x along the boresight, y right, z down) to NED. Below -60 deg elevation
+    the azimuth is that of the image's upper edge, and roll is 0.
+    """
     forward = quat.rotate(quaternion_ned, (1.0, 0.0, 0.0))
     right = quat.rotate(quaternion_ned, (0.0, 1.0, 0.0))
     up = quat.rotate(quaternion_ned, (0.0, 0.0, -1.0))

@@ -72,7 +72,7 @@ class LookAt:
         self._lock = threading.Lock()
 
     def report(self, target: TargetReport) -> None:
-        """Update the position of a target, which the gimbal may follow."""
+        """Update the position of a target, which the gimbal may follow or be told to."""
         with self._lock:
             self._targets[target.target_id] = target
             if self._number and target.target_id == self._number:
@@ -98,7 +98,9 @@ class LookAt:
         return int(mavlink.MAV_RESULT_DENIED)
 
     def due(self, now_ns: int) -> tuple[int, int, int, int, float] | None:
-        """COMMAND_INT for the autopilot: command, frame, x, y, z; None if none is due."""
+        """COMMAND_INT for the autopilot, which counts as sent: command, frame, x and y (1e-7
+        degrees), z (m). None if none is due. An answer that is missing for 3 s is reported.
+        """
         with self._lock:
             if self._asked_ns is not None and now_ns - self._asked_ns > _PATIENCE_NS:
                 self._asked_ns = None

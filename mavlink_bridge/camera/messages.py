@@ -119,7 +119,7 @@ def camera_fov_status(
 
 
 def track_request(message: Any, time_ns: int) -> TrackRequest | None:
-    """Track request of a COMMAND_LONG or COMMAND_INT; None for another command."""
+    """Track request of a command, without a number yet; None if other or outside the image."""
     if message.command == mavlink.MAV_CMD_CAMERA_TRACK_POINT:
         coordinates = (message.param1, message.param2)
         if not all(0.0 <= c <= 1.0 for c in coordinates):

@@ -26,7 +26,7 @@ _ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's numbe
 
 
 def tracking_image_status(report: TargetReport | None) -> Any:
-    """CAMERA_TRACKING_IMAGE_STATUS (275): the target's position in the image; None: idle."""
+    """CAMERA_TRACKING_IMAGE_STATUS (275): its rectangle or point; None or without both: idle."""
     if report is None or (report.pixel is None and report.rectangle is None):
         active, mode = mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE, 0
         point, rectangle = (NAN, NAN), (NAN,) * 4
@@ -56,7 +56,7 @@ def tracking_geo_status(
 ) -> Any:
     """CAMERA_TRACKING_GEO_STATUS (276): the target's coordinates with accuracies.
 
-    camera: the aircraft's position, for distance; altitudes are AMSL.
+    camera: the aircraft's position, for the distance (None: NaN). Altitudes are AMSL.
     """
     altitude = report.height_m - geoid_separation_m
     velocity = report.velocity_ned or (NAN, NAN, NAN)
@@ -121,7 +121,7 @@ def _status(report: TargetReport) -> int:
 
 
 def adsb_vehicle(report: TargetReport, geoid_separation_m: float) -> Any:
-    """ADSB_VEHICLE (246) for a target, so that every ground station draws it."""
+    """ADSB_VEHICLE (246) for a target, so that every ground station draws it; altitude AMSL."""
     velocity = report.velocity_ned
     flags, heading, speed, climb = _ADSB_FLAGS, 0, 0, 0
     if velocity is not None:

@@ -69,7 +69,9 @@ class ClosedLoopCheck:
         sigma_m: float,
         reset_counter: int = 0,
     ) -> None:
-        """Add a sent position: valid at stamp_ns, metres north and east of the EKF origin."""
+        """Add a position that was sent at now_ns: valid at stamp_ns, metres north and east of the
+        EKF origin, with a horizontal sigma. A reset_counter unlike the one before announces a jump.
+        """
         if self._reset_counter not in (None, reset_counter):
             self._jump_ns = now_ns + _TAKES_NS
             self._announced_ns, self.jumping = now_ns, True
@@ -114,8 +116,8 @@ class ClosedLoopCheck:
         }
 
     def is_jump_missed(self) -> bool:
-        """Whether an announced jump must be announced again (up to five times): the EKF did not
-        follow.
+        """Whether an announced jump must be announced again, because the EKF did not follow: True
+        once for each announcement, up to five times.
 
         In each of its steps ArduPilot's EKF uses only the newest measurement. If two arrive
         together, it never uses the first one, which had the new reset_counter. It then refuses all

@@ -108,7 +108,7 @@ def pose_covariance(
 def vision_position_estimate(
     e: EncodedEstimate, ned: tuple[float, float, float], formula: CovarianceFormula
 ) -> Any:
-    """VISION_POSITION_ESTIMATE (102). ned: metres from the EKF origin; yaw from true north."""
+    """VISION_POSITION_ESTIMATE (102). ned: m from the EKF origin; NaN angles if unknown."""
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
     angles = (NAN, NAN, NAN) if e.quaternion is None else quat.to_euler(e.quaternion)
     return mavlink.MAVLink_vision_position_estimate_message(
@@ -159,8 +159,8 @@ def odometry(
 def vision_position_delta(
     before: tuple[VisionFix, Attitude], now: tuple[VisionFix, Attitude]
 ) -> Any | None:
-    """VISION_POSITION_DELTA (11011): motion and rotation between two fixes, in body axes at the
-    second; None if the velocity is less certain than the message can state.
+    """VISION_POSITION_DELTA (11011): motion (m) and rotation between two fixes, in body axes at the
+    second; None if that is not by odometry, or less certain than the message can state.
 
     before, now: each fix with the autopilot's attitude at its time. ArduPilot dates the message
     VISO_DELAY_MS before its arrival.
@@ -306,7 +306,9 @@ class InjectionContext:
 def vision_attitude(
     fix: VisionFix, time_ns: int, context: InjectionContext
 ) -> quat.Quaternion | None:
-    """Vision's attitude at time_ns: that of the fix, rotated as the autopilot rotated since."""
+    """Vision's attitude, body to NED, at time_ns: the fix's, turned as the autopilot turned since
+    (if that is known). None if the fix has none.
+    """
     if time_ns == fix.time_ns or fix.quaternion is None:
         return fix.quaternion
     then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)

@@ -64,7 +64,7 @@ class PositionCommand:
         return bool(self._fuses) and now_ns - self._accepted_ns < _ANSWERED_NS
 
     def should_ask(self, state: VehicleState, now_ns: int) -> bool:
-        """Whether to send this fix as a test although no command was accepted; once a second."""
+        """Note that a fix is held. True, at most once a second: send it all the same as a test."""
         if now_ns - self._held_ns > _ASK_NS:
             self._held_since_ns = now_ns
         self._held_ns = now_ns
@@ -81,7 +81,7 @@ class PositionCommand:
         return True
 
     def is_held(self, now_ns: int) -> bool:
-        """Whether no fix was sent for more than 2 s, longer than an answer takes."""
+        """Whether fixes have been held (`should_ask`) for over 2 s, longer than an answer takes."""
         is_recent = now_ns - self._held_ns < _ASK_NS
         return is_recent and self._held_ns - self._held_since_ns > _ANSWERED_NS
 
@@ -137,12 +137,14 @@ class FixSender:
             self._command.add_answer(ack.result, now_ns)
 
     def rebooted(self) -> None:
-        """Reset yaw guard and command state after a reboot of the autopilot."""
+        """Reset the yaw guard and the position command's state: the autopilot rebooted."""
         self.injector.guard.reset()
         self._command = None if self._command is None else PositionCommand()
 
     def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
-        """Send what is due if the mode allows it, otherwise report why not. mode: not ``off``."""
+        """Make the message that is due; send it in mode ``inject``, and only compare its position
+        with GNSS in ``shadow``. Report why none is made or sent. mode: not ``off``.
+        """
         profile = select_profile(state.autopilot, state.version)
         context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)
         injection = self.injector.step(now_ns, context)

@@ -29,7 +29,7 @@ class FixWarnings:
         self._notifier = notifier
 
     def check_firmware(self, state: VehicleState, profile: FirmwareProfile) -> None:
-        """Report a firmware that is unknown or does not support the configured message."""
+        """Report a known firmware without a profile, or without the configured message."""
         if not state.connected or state.version is None:
             return
         self._notifier.notify("profile", None if profile.known else alert(AlertId.UNKNOWN_FIRMWARE))

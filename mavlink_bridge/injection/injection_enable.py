@@ -53,7 +53,7 @@ class InjectionEnable:
         self._at_start = alert(AlertId.INJECTION_OFF, by=InjectionOrder.START)
 
     def recall(self) -> None:
-        """Enable injection if a process that crashed had enabled it; `announce` reports it."""
+        """Enable injection, before the links start, if a process that crashed had enabled it."""
         remembered = self._memory.recall() if self._memory is not None else None
         if remembered is None:
             return
@@ -67,21 +67,23 @@ class InjectionEnable:
             self._memory.store_enabled(by_channel=by_channel)
 
     def announce(self) -> None:
-        """Report the state after the start; called once a link is connected."""
+        """Report the state at the start (off, or restored); called once a link is connected."""
         self._changed(self._at_start)
 
     def stop(self, *, clean_shutdown: bool = True) -> None:
-        """End the memory; a clean shutdown keeps nothing for a restart."""
+        """End the memory; a clean shutdown deletes the stored state. The first call counts."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
     @property
-    def open(self) -> bool:
+    def enabled(self) -> bool:
         """Whether injection is enabled."""
         return self._open
 
     def on_rc_channels(self, pulses_us: Sequence[int]) -> None:
-        """Process RC_CHANNELS (us): crossing the threshold enables or disables injection."""
+        """Process the pulse widths of RC_CHANNELS: crossing the threshold enables or disables
+        injection; at the first report only a switch that is on counts.
+        """
         number = self._config.channel
         pulse = pulses_us[number - 1] if len(pulses_us) >= number else 0
         if not _PULSE_US[0] <= pulse <= _PULSE_US[1]:
@@ -98,7 +100,7 @@ class InjectionEnable:
     def command(self, command: int, wanted: float) -> int:
         """Process a command to the localizer's component; returns the MAV_RESULT.
 
-        wanted: the command's param1, 1 enables and 0 disables injection.
+        wanted: the command's param1, 1 enables and 0 disables injection; any other is denied.
         """
         if self._config.command is None or command != COMMANDS[self._config.command]:
             return int(mavlink.MAV_RESULT_UNSUPPORTED)

@@ -101,14 +101,14 @@ class _FixRate:
 
 
 class WithheldMotion:
-    """Makes VISION_POSITION_DELTA from two fixes whose positions are withheld."""
+    """Makes VISION_POSITION_DELTA from odometry's fixes whose positions are not sent."""
 
     def __init__(self) -> None:
         self._before: VisionFix | None = None
         self._message: Any | None = None
 
     def add(self, fix: VisionFix, now_ns: int, context: InjectionContext) -> None:
-        """Add a fix with a withheld position that has reached the age `delay_ms`."""
+        """Add a fix that has reached the age `delay_ms`, and whose position is not sent."""
         before, self._before = self._before, fix
         late = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
         if before is None or late or not context.profile.position_delta:
@@ -124,7 +124,7 @@ class WithheldMotion:
 
 
 class Injector:
-    """Sends fixes at a steady rate; see the module. One thread calls `submit` and `step`."""
+    """Makes the messages of fixes at a steady rate; one thread calls `submit` and `step`."""
 
     def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
         self._config = config
@@ -196,7 +196,7 @@ class Injector:
         self._announced += 1
 
     def clear(self) -> None:
-        """Drop the queued fixes, because nothing can be sent now."""
+        """Drop the queued fixes, because nothing can be sent now; propagation keeps the last."""
         self._waiting.clear()
         self._fresh = None
 
@@ -218,7 +218,7 @@ class Injector:
         return outcome
 
     def next_due_ns(self, now_ns: int) -> int:
-        """When `step` must be called next."""
+        """When to call `step` next, CLOCK_MONOTONIC ns; at least 0.5 ms after now_ns."""
         due = [now_ns + self._period_ns]
         if self._waiting:
             due.append(self._waiting[0].time_ns + self._delay_ns)

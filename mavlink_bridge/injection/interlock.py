@@ -59,14 +59,14 @@ class ShadowInterlock:
             self._notifier.report(self._against)
 
     def end(self, *, clean_shutdown: bool = True) -> None:
-        """End the memory; a clean shutdown keeps nothing for a restart."""
+        """End the memory; a clean shutdown deletes the stored failure. The first call counts."""
         if self._memory is not None:
             self._memory.stop(clean_shutdown=clean_shutdown)
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
-        """The mode that is allowed: ``shadow`` for ``inject`` while the interlock holds. by_pilot:
-        the pilot enabled injection in mode ``rc``; this is followed, and reported if the shadow
-        check has not passed.
+        """The mode that is allowed: ``shadow`` for ``inject`` until injection may begin, after that
+        always ``inject``. by_pilot: the mode is ``rc``; the pilot's ``inject`` is followed,
+        reported if the shadow check has not passed, and ended by the pilot's ``shadow``.
         """
         self._update(state, now_ns)
         if wanted != "inject":
@@ -97,7 +97,10 @@ class ShadowInterlock:
         return self._reason
 
     def may_switch(self, now_ns: int) -> bool:
-        """Whether the EKF may switch to vision: verified lately, never any GNSS, or `force`."""
+        """Whether the EKF may switch to vision: by `force`; or, while no alert inhibits, if the
+        shadow check has passed in the last 10 min and at most 30 s before the last comparison, or
+        if injection runs and nothing was ever compared.
+        """
         if self._force:
             return True
         if self.inhibited_by:
@@ -137,7 +140,7 @@ class ShadowInterlock:
             return
         self._next_ns = now_ns + _PERIOD_NS
         score = self._score(now_ns)
-        if score.go:
+        if score.ready:
             self._go_ns, self._against = self._compared_ns(), None
         elif score.samples >= MINIMUM_SAMPLES:
             # It stays when its samples age: a wrong map is wrong without GNSS, too. A low rate

@@ -49,12 +49,12 @@ class InjectionOutcome:
         self._to_compare: deque[PropagatedFix] = deque(maxlen=_QUEUE)
 
     def add_computed(self, estimate: EncodedEstimate) -> None:
-        """Add an estimate that is due, whether it is sent or not, for the comparison with GNSS."""
+        """Add a due estimate, sent or not, to compare with GNSS; propagated ones are ignored."""
         if estimate.fresh:
             self._to_compare.append(estimate.position)
 
     def add_sent(self, estimate: EncodedEstimate, now_ns: int) -> None:
-        """Add an estimate that was sent to the flight controller, for the check of the EKF."""
+        """Add a sent estimate, for the check of the EKF; ignored without an EKF origin."""
         origin, position = self._origin.origin, estimate.position
         if origin is None:
             return
@@ -88,8 +88,8 @@ class InjectionOutcome:
                 self.compared_ns = fix.time_ns
 
     def check_ekf(self, state: VehicleState, now_ns: int) -> bool:
-        """Check and report whether the EKF follows: also after each jump, when it is settled.
-        True if a jump must be announced again.
+        """Update `verdict`, and report whether the EKF follows: also after each jump, when it is
+        settled. True, once, if the caller must announce a jump again, which is reported.
         """
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
         unsettled = bool(self.ekf_ok_inhibited_by) or self._loop.jumping

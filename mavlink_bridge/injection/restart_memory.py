@@ -55,7 +55,9 @@ class RestartMemory:
         self._thread.start()
 
     def recall(self) -> tuple[dict[str, Any], float] | None:
-        """The stored state and its age, s; None if there is none or it cannot be trusted."""
+        """The stored state and its age, s; None if there is none, it is older than 600 s, or it
+        cannot be trusted. After this call a clean `stop` deletes the file.
+        """
         self._in_use = True
         try:
             status = os.lstat(self._path)
@@ -76,13 +78,13 @@ class RestartMemory:
         return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
 
     def store(self, state: dict[str, Any]) -> None:
-        """Write this state now and every 30 s."""
+        """Write this state (JSON values) now and every 30 s, in the memory's thread."""
         self._in_use = True
         self._state = state
         self._wake.set()
 
     def drop(self) -> None:
-        """Delete the file, and store nothing from now on."""
+        """Delete the file, in the memory's thread, and write nothing until the next `store`."""
         self._state = None
         self._wake.set()
 
@@ -171,7 +173,7 @@ class ShadowFailureMemory:
         self._kept = False
 
     def recall(self) -> bool:
-        """Whether the shadow check had failed in the previous process."""
+        """Whether the shadow check had failed in the previous process; that is stored again."""
         found = self._memory.recall()
         state = None if found is None else found[0].get("against")
         of_0_1 = isinstance(state, str) and bool(state) and state.isprintable()  # the reason

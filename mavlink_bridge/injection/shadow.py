@@ -38,13 +38,14 @@ _CONSISTENCY_LIMIT = 9.0 * 1.39
 class ShadowScore:
     """Comparison of vision with GNSS over the last two minutes; errors are horizontal.
 
-    go: the check has passed. Without samples the figures are None. bias_ne_m: mean north and east
-    difference. height_m: median difference of the heights. consistency: median squared Mahalanobis
-    distance (1.4 is ideal). reasons: why the check has not passed; empty if it has. against: those
-    of the reasons that show wrong positions, and not only too few.
+    ready: the check has passed. Without samples the figures are None. bias_ne_m: mean north and
+    east difference, vision minus GNSS. height_m: median difference of the heights likewise,
+    positive if vision is higher. consistency: median squared Mahalanobis distance (1.4 is ideal).
+    reasons: why the check has not passed; empty if it has. against: those of the reasons that show
+    wrong positions, and not only too few.
     """
 
-    go: bool
+    ready: bool
     samples: int
     reasons: tuple[Alert, ...]
     median_m: float | None = None
@@ -56,11 +57,11 @@ class ShadowScore:
     against: tuple[Alert, ...] = ()
 
     def line(self) -> str:
-        """One line for the operator."""
+        """Whether it is ready, the reasons and the errors, as one line for the operator."""
         figures = ""
         if self.median_m is not None and self.p95_m is not None:
             figures = f"median {self.median_m:.1f} m, p95 {self.p95_m:.1f} m, n {self.samples}"
-        if self.go:
+        if self.ready:
             return f"ready: {figures}"
         why = "; ".join(reason(of) for of in self.reasons)
         return f"not ready: {why}" + (f" ({figures})" if figures else "")
@@ -81,7 +82,7 @@ class ShadowScorer:
         self._samples: deque[tuple[int, float, float, float, float]] = deque(maxlen=_LENGTH)
 
     def compare(self, fix: PropagatedFix, reference: tuple[float, ...]) -> None:
-        """Compare a fix with the autopilot's (latitude, longitude, altitude AMSL) at its time."""
+        """Add a fix and the autopilot's (latitude, longitude, altitude AMSL) at its time."""
         difference = np.array(
             north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
         )
@@ -93,7 +94,7 @@ class ShadowScorer:
             self._samples.append((fix.time_ns, north, east, distance, up))
 
     def score(self, now_ns: int, refused_yaw_rad: float | None) -> ShadowScore:
-        """The result of the last two minutes. refused_yaw_rad: `Injector.refused_yaw_rad`."""
+        """The result of the last two minutes. refused_yaw_rad: None unless the yaw guard blocks."""
         with self._lock:
             samples = np.array([s for s in self._samples if now_ns - s[0] < _WINDOW_NS])
         if not len(samples):

@@ -117,7 +117,8 @@ def gnss_fault(
     state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
 ) -> GnssFault | None:
     """Why GNSS is bad: lost, glitching, or farther from vision than both errors allow; None if
-    good. sigmas: how many of both errors a distance may have.
+    good. vision: newest position, None: not compared. sigmas: how many of both errors a distance
+    may have.
     """
     if not gnss_healthy(state, now_ns):
         return GnssFault(GnssProblem.LOST, proven=True)
@@ -300,8 +301,9 @@ class SourceOrders:
         return self._switch.returning.refusal is not None
 
     def on_first_message(self, state: VehicleState) -> None:
-        """Process the vehicle's first message. An armed ArduPilot may use any source set (this
-        process was restarted); a disarmed one uses its first.
+        """Process the vehicle's state at its first message; further calls do nothing. The set of an
+        ArduPilot that is armed already is unknown, because this process may have been restarted,
+        which is reported; a disarmed one uses its first.
         """
         if self._has_met:
             return
@@ -317,7 +319,7 @@ class SourceOrders:
             self._switch.on_reported_set(int(told[1]))
 
     def rebooted(self) -> None:
-        """Assume the first source set after a reboot of the flight controller."""
+        """Assume the GNSS set, because the flight controller rebooted and uses its first."""
         self._switch.reset()
         self._notifier.forget("switch")
 
@@ -336,8 +338,8 @@ class SourceOrders:
         may_switch: bool,
         now_ns: int,
     ) -> None:
-        """Send an order if one is due, and report refusals. good: positions are sent
-        and reliable.
+        """Send and report an order if one is due, and report why none is sent although GNSS is bad,
+        and a receiver that contradicts vision. Parameters: as `SourceSwitch.decide`.
         """
         order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
         self._report_refused(now_ns)

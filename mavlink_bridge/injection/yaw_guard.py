@@ -55,7 +55,7 @@ class YawGuard:
 
     @property
     def blind(self) -> bool:
-        """Whether fixes have passed for a while without a yaw to compare."""
+        """Whether the last 20 or more fixes had no yaw to compare."""
         return self._unchecked_in_a_row >= _BLIND_AFTER
 
     def reset(self) -> None:
@@ -65,7 +65,9 @@ class YawGuard:
         self.blocked = False
 
     def check(self, fix: VisionFix, autopilot: Attitude | None) -> YawVerdict:
-        """Check one fix; it passes as the last result if a yaw is unknown (`unchecked`)."""
+        """Check one fix, in order of time. autopilot: its attitude at that time, None if unknown. A
+        fix without both yaws passes unless the guard blocks, and counts as `unchecked`.
+        """
         if not self._config.enabled:
             return YawVerdict(True, None)
         time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad

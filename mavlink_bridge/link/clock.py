@@ -174,7 +174,7 @@ class BootClock:
         return bool(self._behind) or bool(self._ahead)
 
     def observe(self, boot_ns: int, received_ns: int) -> bool:
-        """Process a message's boot time, ns; True if the flight controller rebooted."""
+        """Process a message's boot time, ns. True, and all else is forgotten, after a reboot."""
         rebooted = self._ran_back(boot_ns, received_ns)
         if self._behind:
             return False  # an old frame that came late, or the first ones after a reboot
@@ -195,7 +195,9 @@ class BootClock:
         return rebooted
 
     def timesync(self, boot_ns: int, sent_ns: int, received_ns: int) -> bool:
-        """Process a TIMESYNC answer (tc1 = boot_ns, ts1 = sent_ns); True after a reboot."""
+        """Process a TIMESYNC answer (tc1 = boot_ns, ts1 = sent_ns); True if it shows a reboot.
+        Ignored after a round trip of over 0.5 s, or if it contradicts the stamps of now.
+        """
         round_trip = received_ns - sent_ns
         if not 0 <= round_trip <= _MAX_ROUND_TRIP_NS or self._contradicts(boot_ns, received_ns):
             return False
@@ -211,7 +213,7 @@ class BootClock:
         return rebooted
 
     def to_monotonic(self, boot_ns: int, received_ns: int) -> int:
-        """CLOCK_MONOTONIC of a boot time; at most received_ns, the message's arrival."""
+        """CLOCK_MONOTONIC of a boot time; received_ns (arrival) at most, and if unknown."""
         if self._anchor is None:
             return received_ns
         middle_ns, at_ns = self._anchor

@@ -53,7 +53,7 @@ class VerifyingMavlink(mavlink.MAVLink):
     window: ReplayWindow | None = None
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Whether the frame is signed with our key and newer than the last of its stream."""
+        """Whether our key signed the frame, after its stream's last one, which it now becomes."""
         digest = hashlib.sha256(self.signing.secret_key + bytes(msgbuf[:-6])).digest()[:6]
         if digest != bytes(msgbuf[-6:]):
             return False
@@ -107,7 +107,7 @@ class FrameReader:
         return int(self._codec.signing.timestamp) if self._signed else 0
 
     def reset(self) -> None:
-        """Drop an incomplete frame: the transport was reopened. Signing streams are kept."""
+        """Drop incomplete frame and sequence numbers (transport reopened), not signing streams."""
         self._buffer.clear()
         self._sequences.clear()
 
@@ -122,7 +122,9 @@ class FrameReader:
         return len(self._sequences)
 
     def feed(self, data: bytes, raw: deque[bytes] | None = None) -> list[Any]:
-        """Messages completed by `data`; raw frames of right checksum are appended to `raw`."""
+        """The wanted messages that `data` completes, without those that fail signing. All frames of
+        right checksum, these too, are appended to `raw`.
+        """
         buffer = self._buffer
         buffer += data
         messages: list[Any] = []

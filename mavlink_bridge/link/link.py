@@ -172,7 +172,9 @@ class Link:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the owner thread and close the transport."""
+        """Stop the owner thread, wait for it (5 s at most), and close the transport and the
+        options' `window`. Harmless when called again.
+        """
         self._stop.set()
         self.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
@@ -183,11 +185,14 @@ class Link:
             self._waker.close()
 
     def wake(self) -> None:
-        """Make the owner thread run `on_tick` now."""
+        """Make the owner thread run `on_tick` now; returns at once. From any thread."""
         self._waker.wake()
 
     def send(self, message: Any, component: int) -> bool:
-        """Send as `component` of system_id; False if dropped at once. Other threads queue it."""
+        """Send as `component` of `system_id`. In the owner thread: at once; False if dropped,
+        because the transport is closed or full, or system_id is 0. From other threads: queue it and
+        return True; of 512 queued messages the oldest is dropped.
+        """
         if threading.current_thread() is self._thread:
             return self._send_now(message, component)
         if len(self._outbox) == _OUTBOX:
@@ -204,7 +209,7 @@ class Link:
         return {**mine, **asdict(self._reader.counters)}
 
     def queue_lengths(self) -> dict[str, int]:
-        """Lengths of the queues: messages of other threads, bytes received and to send."""
+        """Lengths of the queues: messages of other threads (outbox), bytes to send and received."""
         return {
             "outbox": len(self._outbox),
             "unsent": len(self._unsent),

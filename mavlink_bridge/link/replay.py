@@ -46,7 +46,7 @@ class ReplayWindow:
 
     @property
     def newest(self) -> int:
-        """The newest time stamp that may have been accepted, 10 us ticks; 0 for none."""
+        """The newest stored stamp, 10 us ticks, 2 s ahead of the accepted one; 0 for none."""
         with self._lock:
             return max(self._leases.values(), default=0)
 
@@ -59,7 +59,7 @@ class ReplayWindow:
         self._due.set()
 
     def close(self) -> None:
-        """Write the last state and end; waits at most about two seconds for a disk that hangs."""
+        """Write the last state and end the thread; waits about 2 s at most for a hanging disk."""
         self._closing = True
         self._due.set()
         self._thread.join(2.0)

@@ -46,7 +46,7 @@ def load_key(path: Path) -> bytes:
 
 
 def create_key(path: Path) -> bytes:
-    """Write a new random key to a new file of mode 0600, and return it. May raise OSError."""
+    """Write a new random key to a new file of mode 0600 and return it; OSError if it exists."""
     key = os.urandom(32)
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w", encoding="ascii") as file:

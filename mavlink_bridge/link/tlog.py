@@ -99,7 +99,7 @@ class TlogRecorder:
         self._thread.start()
 
     def write(self, frame: bytes, time_us: int) -> None:
-        """Queue one frame, received or sent at time_us (UTC, microseconds); never blocks."""
+        """Queue a frame of time_us (UTC, microseconds), or drop it if 8192 wait; never blocks."""
         if len(self._waiting) >= _MAX_WAITING:
             self.dropped += 1
             return
@@ -164,9 +164,9 @@ class TlogRecorder:
 
 
 def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
-    """Yield (UTC ns, message) of every frame of a .tlog in file order; damaged frames are skipped.
-
-    Raises `TlogError` where the file cannot be read or holds something else.
+    """Yield (UTC ns, message) of every frame of a .tlog in file order; frames that cannot be
+    decoded are skipped. `TlogError`, while it is iterated, for a file that cannot be read or has no
+    frame, and where no frame begins after the one before.
     """
     try:
         status = path.stat()

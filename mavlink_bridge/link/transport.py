@@ -168,7 +168,7 @@ class UdpTransport:
         return data
 
     def keep_peer(self) -> None:
-        """Make the sender of the last datagram the only accepted peer."""
+        """Without `remote`: make the sender of the last datagram the only accepted peer."""
         if self._learn:
             self._remote = self._peer = self._sender
             self._heard_s = time.monotonic()
@@ -238,7 +238,7 @@ class TcpTransport:
 
 
 class SerialTransport:
-    """A serial port, by pyserial."""
+    """A serial port, by pyserial; `EndpointError` if that is not installed."""
 
     stream = True
 
@@ -281,7 +281,9 @@ def _accept(endpoint: Endpoint) -> TcpTransport:
 
 
 def open_transport(endpoint: Endpoint) -> Transport:
-    """Open the endpoint; OSError if that fails and a retry may succeed. TCP waits for 2 s."""
+    """Open the endpoint; OSError if that fails and a retry may succeed, `EndpointError` without
+    pyserial. Blocks up to 2 s for a TCP connection (tcpin: for a client), and to resolve a name.
+    """
     where = (endpoint.address, endpoint.number)
     if endpoint.kind == "udpin":
         return UdpTransport(where, None)

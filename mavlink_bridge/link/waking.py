@@ -22,7 +22,7 @@ class WakePipe:
         os.set_blocking(self.write_end, False)
 
     def wake(self) -> None:
-        """Make the read end readable."""
+        """Make the read end readable; never blocks, and does nothing after `close`."""
         # A full pipe wakes the thread anyway, and a closed one has no thread to wake.
         with self._lock, contextlib.suppress(BlockingIOError):
             if not self._closed:

@@ -26,8 +26,9 @@ class Jumps:
         self.notes: dict[str, None] = {}
 
     def following(self, item: MissionItem, index: int, commands: int) -> int | None:
-        """Index of the item after the jump at `index`; None if the mission ends. commands: number
-        executed so far.
+        """Index of the item to continue with after executing the jump `item` at `index`, which is
+        counted; None if the mission ends. commands: number of other commands executed so far, to
+        detect jumps in a circle.
         """
         last, jumps = self._in_a_row
         self._in_a_row = (commands, jumps + 1 if last == commands else 1)

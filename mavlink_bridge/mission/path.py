@@ -120,9 +120,10 @@ def planned_path(
     vehicle: MissionVehicle = UNKNOWN_VEHICLE,
     speed_m_s: float | None = None,
 ) -> PlannedMission:
-    """Compute the flight path of a mission's items (without home). speed_m_s: default speed.
-
-    MissionError for an impossible position, or one in a frame without global coordinates.
+    """Compute the flight path of a mission's items (without item 0, home). home: (latitude,
+    longitude) degrees, None: unknown, then returns are `not_judged`. speed_m_s: until the mission
+    commands one. MissionError for an impossible position, or one in a frame without global
+    coordinates.
     """
     flight = _Flight(items, home, vehicle, speed_m_s)
     flight.run()

@@ -81,11 +81,11 @@ class VehicleClient:
         """Process a message of the autopilot, other than its heartbeat."""
 
     def ask(self, message: Any) -> None:
-        """Send a message as the companion."""
+        """Send a message as the companion; the answer comes to `take`, see `wait_for`."""
         self._link.send(message, self.config.companion_component)
 
     def wait_for(self, predicate: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until the predicate holds; False after the timeout."""
+        """Wait until the predicate holds, tested after each message; False after the timeout."""
         with self._changed:
             return self._changed.wait_for(predicate, timeout_s)
 
@@ -138,7 +138,7 @@ class DetectedAutopilot:
 
 
 def detect_autopilot(config: BridgeConfig) -> DetectedAutopilot:
-    """Detect the autopilot at `config.connection`; `ConnectionSilentError` without one."""
+    """The autopilot at `config.connection`; `ConnectionSilentError` without one for 15 s."""
     with VehicleClient(config, "meeting", ()) as client:
         number = client.autopilot
         return DetectedAutopilot(client.system, _FIRMWARES.get(number, f"MAV_AUTOPILOT {number}"))

@@ -133,7 +133,10 @@ class _Measurement:
 
 
 def check_link(config: BridgeConfig) -> tuple[list[DoctorFinding], VehicleState]:
-    """Connect in shadow mode for some seconds; check identity, clock and streams."""
+    """Connect in shadow mode for some 7 s (15 s without a vehicle); check identity, clock and
+    streams. The findings, of which the first is the connection's, and the vehicle's state. No other
+    program may use the connection.
+    """
     quiet = config.model_copy(update={"mode": "shadow", "tlog": None})
     with Bridge(quiet, 0.0) as bridge:
         if not sleep_until(lambda: bridge.state().connected, _CONNECT_S, step_s=0.05):
@@ -265,7 +268,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Docto
 
 
 def check_computer_clock(config: BridgeConfig) -> list[DoctorFinding]:
-    """Check this computer's clock, which is wrong after a start without a battery."""
+    """Check that this computer's clock is set; [] if neither GPS_INPUT nor signing needs it."""
     if config.injection.message != "gps_input" and not (config.signing or config.ground_signing):
         return []
     utc = SteadyUtc()
@@ -275,7 +278,9 @@ def check_computer_clock(config: BridgeConfig) -> list[DoctorFinding]:
 
 
 def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -> Diagnosis:
-    """Run all checks on the vehicle. say: receives each step as text."""
+    """Run all checks on the vehicle, for 7 s or more, and write none of its parameters. Without a
+    vehicle, or with several, no parameters are checked. say: receives each step as text.
+    """
     findings, state = check_link(config)
     findings += check_computer_clock(config)
     if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
@@ -317,7 +322,8 @@ def _source_switch_of_px4(config: BridgeConfig) -> list[DoctorFinding]:
 
 
 def repair(config: BridgeConfig, findings: Iterable[DoctorFinding]) -> bool:
-    """Write the value of each `DoctorFinding.fix` in order; True if a reboot is needed.
+    """Write the value of each `DoctorFinding.fix` to the vehicle, in order; True if a reboot is
+    needed, which is not ordered. `ParameterError` ends it at the first value that is not accepted.
 
     The order matters: the other VISO parameters exist only after VISO_TYPE is set.
     """

@@ -74,7 +74,7 @@ PARAMETERS = (*(wanted.name for wanted in _WANTED), "FENCE_TYPE", "FENCE_ACTION"
 
 
 def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
-    """Check ArduPilot's failsafe parameters; missing ones are skipped."""
+    """Check ArduPilot's failsafe parameters; missing ones are skipped. [] in mode ``off``."""
     if config.mode == "off":
         return []
     lines = [*_listed(_WANTED, read), *_fence(read)]
@@ -88,7 +88,7 @@ def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
 
 
 def px4_failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
-    """Check PX4's failsafe parameters (1.15 and later)."""
+    """Check PX4's failsafe parameters (1.15 and later); as `failsafes`."""
     if config.mode == "off":
         return []
     lines = _listed(_PX4_WANTED, read)

@@ -99,6 +99,8 @@ def _is_local(message: Any) -> bool:
 
 
 def download_mission(config: BridgeConfig) -> list[MissionWaypoint]:
-    """Download the mission's positions from the flight controller at `config.connection`."""
+    """Download home (if it is known, first) and the mission's positions in flight order from the
+    flight controller at `config.connection`. `ConnectionSilentError` or `MissionError` if it fails.
+    """
     with MissionDownloader(config) as client:
         return client.download()

@@ -52,7 +52,7 @@ class ParameterClient(VehicleClient):
         self._values: dict[str, tuple[float, int]] = {}
 
     def read(self, name: str) -> float | None:
-        """The parameter's value; None if the flight controller has no such parameter."""
+        """The parameter's value; None if it does not exist, or no answer comes in 2 s."""
         self._values.pop(name, None)
         request = mavlink.MAVLink_param_request_read_message(
             self.system, self.component, name.encode("ascii"), -1
@@ -64,8 +64,8 @@ class ParameterClient(VehicleClient):
         return None
 
     def read_known(self, names: Collection[str]) -> dict[str, float]:
-        """Values of those parameters that exist, requested together, so that all missing ones cost
-        one timeout.
+        """Values by name of those parameters that were answered within 0.7 s. All are requested
+        together and once, so that all missing ones cost one timeout.
         """
         for name in names:
             self._values.pop(name, None)

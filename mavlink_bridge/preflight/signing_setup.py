@@ -39,7 +39,8 @@ def install_key(connection: str, key_file: Path) -> bool:
     """Send the key of a file to the autopilot; True if its heartbeat is then signed with it.
 
     False on ArduPilot's USB port, which stays unsigned, and if the autopilot already used another
-    key. Raises `BridgeStateError` if the vehicle is armed, because ArduPilot then ignores the key.
+    key. Raises `BridgeStateError` if the vehicle is armed, because ArduPilot then ignores the key;
+    `ConnectionSilentError` without a vehicle, `SigningKeyError` for an unusable key file.
     """
     key = load_key(key_file)
     config = BridgeConfig(connection=connection)

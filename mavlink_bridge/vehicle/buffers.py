@@ -67,7 +67,7 @@ def attitude(
 
 
 def heading_rate(sample: Attitude) -> float:
-    """Rate of the heading, rad/s, from body rates and attitude."""
+    """Rate of the heading, rad/s, clockwise positive, from body rates and attitude."""
     _, q, r = sample.rates
     cos_pitch = max(math.cos(sample.pitch_rad), 0.1)
     return (q * math.sin(sample.roll_rad) + r * math.cos(sample.roll_rad)) / cos_pitch
@@ -127,12 +127,12 @@ class ZoomBuffer:
         self._component: int | None = None
 
     def clear(self) -> None:
-        """Empty the buffer."""
+        """Empty the buffer; the camera that reports next is then used."""
         self._samples.clear()
         self._component = None
 
     def add(self, time_ns: int, component: int, level: float) -> None:
-        """Append a level; NaN: the camera does not know it."""
+        """Append a level; NaN: the camera does not know it. Ignored from another component."""
         if self._component is None:
             self._component = component
         newer = not self._samples or time_ns > self._samples[-1].time_ns

@@ -70,7 +70,8 @@ class _Speaker:
 
 
 def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float = 0.8) -> bool:
-    """Send an alert on every link of the bridge, for the supervisor after the flight process died.
+    """Open every link of the bridge, send an alert, and close them again; for the supervisor after
+    the flight process died, because a live one holds the links.
 
     True if it was sent on at least one within `timeout_s` (for all links together); whether anybody
     received it is unknown. `SigningKeyError` for an unusable key file.

@@ -50,7 +50,7 @@ def waypoint_of(item: Any) -> MissionWaypoint | None:
 
 
 def mission_item(message: Any) -> MissionItem:
-    """Convert a MISSION_ITEM_INT to a `MissionItem` (degrees instead of 1e-7 degrees)."""
+    """Convert a MISSION_ITEM_INT: degrees instead of 1e-7 degrees, 0 for the present position."""
     x, y = float(message.x), float(message.y)
     if (message.x, message.y) in _HERE:
         x = y = 0.0
@@ -82,12 +82,14 @@ class MissionWatch:
         self._due_ns = 0
 
     def reset(self) -> None:
-        """Read the mission again, because the vehicle rebooted or is another."""
+        """Read the mission again after a reboot or for another vehicle; `waypoints` stay till
+        then.
+        """
         self._known = self._reading = self._item = None
         self._due_ns = self._tries = 0
 
     def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Send the request that is due, if any; called at each tick of the link."""
+        """Send the request that is due at this tick, if any; none until `wanted` is set."""
         if not self.wanted:
             return
         flown_as = (state.armed, state.custom_mode)

@@ -74,7 +74,7 @@ def north_east(
 def offset(
     origin_lat: float, origin_lon: float, north_m: float, east_m: float
 ) -> tuple[float, float]:
-    """(latitude, longitude) at a north and east offset; inverse of ArduPilot's `north_east`."""
+    """(latitude, longitude), degrees, at an offset; inverse of ArduPilot's `north_east`."""
     latitude = origin_lat + north_m / METRES_PER_DEGREE
     scale = _longitude_scale((origin_lat + latitude) / 2.0)
     return latitude, wrap_degrees(origin_lon + east_m / (METRES_PER_DEGREE * scale))
@@ -87,7 +87,7 @@ def ned_from_origin(
     altitude_amsl_m: float,
     projection: Projection = "ardupilot",
 ) -> tuple[float, float, float]:
-    """North, east, down from the EKF origin, metres."""
+    """North, east, down from the EKF origin, metres, of an altitude above mean sea level."""
     north, east = north_east(
         origin.latitude_deg, origin.longitude_deg, latitude_deg, longitude_deg, projection
     )
@@ -121,7 +121,8 @@ class OriginKeeper:
         self._next_ns = 0
         self._told = False
         self.moved_m: float | None = None
-        """How far off the origin said last was, if it was refused; None: it was not."""
+        """Distance of the last received origin from the known one, m, if it was refused; else None.
+        """
 
     def reset(self) -> None:
         """Forget the origin and ask again: the flight controller rebooted, or may have."""

@@ -58,12 +58,12 @@ class OriginExchange:
             self._notifier.report(news)
 
     def forget(self) -> None:
-        """Forget the origin, which may have changed; nothing relative to it is sent."""
+        """Forget the origin and request it again; nothing relative to it is sent meanwhile."""
         self._keeper.reset()
         self._tracker.set_origin(None)
 
     def tick(self, link: Link, now_ns: int, *, may_set: bool) -> None:
-        """Send the request that is due. may_set: whether the configured origin may be sent."""
+        """Request the origin if due, and set the configured one if there is none and may_set."""
 
         def ask(wanted: int) -> None:
             self._commander.send(link, mavlink.MAV_CMD_REQUEST_MESSAGE, wanted)

@@ -65,7 +65,7 @@ class DuplicateSystemIdMonitor:
         self._count = 0
 
     def is_duplicate(self, now_ns: int, ran_back: int) -> bool:
-        """Whether it decreased 40 times in 5 s. ran_back: how often it has decreased so far."""
+        """Whether the boot time decreased 40 times in 5 s. ran_back: how often it has so far."""
         many = ran_back - self._count >= _TWIN_SWITCHES
         if many or now_ns - self._begun_ns >= _TWIN_WINDOW_NS:
             self._begun_ns, self._count = now_ns, ran_back

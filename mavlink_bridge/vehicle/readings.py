@@ -107,7 +107,7 @@ class VehicleReadings:
         self._ranger: int | None = None  # id of the sensor whose distances count
 
     def update(self, message: Any, time_ns: int) -> None:
-        """Process one of MESSAGES_IN, valid at time_ns. Raises ValueError for impossible values."""
+        """Process one of MESSAGES_IN, valid at time_ns; ValueError for impossible values."""
         _HANDLERS[message.get_type()](self, message, time_ns)
 
     def set_origin(self, origin: Origin | None) -> None:

@@ -80,7 +80,9 @@ class StreamKeeper:
         self.counts[name] += 1
 
     def due(self, streams: tuple[Stream, ...], now_ns: int) -> list[Stream]:
-        """The streams to request now: at most every 2 s, those silent for 3 s."""
+        """The streams to request now; they count as requested. Each is requested once, and again
+        while it is silent for 3 s (an optional one rarely). Empty within 2 s of the last check.
+        """
         if now_ns < self._next_ns:
             return []
         self._next_ns = now_ns + _CHECK_EVERY_NS

@@ -29,10 +29,12 @@ _OLD_NS = 2_000_000_000
 
 
 class VehicleTracker:
-    """Processes one vehicle's messages. `handle` runs in the link's thread; other methods in any.
+    """Processes one vehicle's messages. `accepts`, `handle` and `timesync` run in the link's
+    thread; other methods in any.
 
     system_id: of the vehicle, None: the first heard. mount: quaternion, camera to gimbal or body.
-    gimbal: component and gimbal_device_id whose angles are used, 0 for any.
+    fixed_camera: mounted on the airframe, so that no gimbal's angles are used. gimbal: component
+    and gimbal_device_id whose angles are used, 0 for any.
     """
 
     def __init__(
@@ -82,7 +84,9 @@ class VehicleTracker:
             return self._readings.attitudes.at(time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time, by gimbal (or body) and mounting; or None."""
+        """The camera's attitude to NED at a time: the gimbal's (fixed camera: the vehicle's),
+        turned by `mount`. None if the vehicle's or the gimbal's is unknown then.
+        """
         with self._lock:
             body = self._readings.attitudes.at(time_ns)
             sample = None if self._fixed else self._readings.gimbals.at(time_ns)
@@ -117,7 +121,7 @@ class VehicleTracker:
             return self._readings.locals.at(time_ns)
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """IMU samples after a time, oldest first; at most the last 10 s."""
+        """IMU samples after a time, oldest first; the newest 512 at most (10 s at 50 Hz)."""
         with self._lock:
             return self._readings.inertial.since(time_ns)
 
@@ -127,7 +131,9 @@ class VehicleTracker:
             self._readings.set_origin(origin)
 
     def accepts(self, message: Any) -> bool:
-        """Whether a message is from the vehicle, which the first heartbeat selects."""
+        """Whether a message is from the system that the first heartbeat selected for good: from its
+        autopilot, or angles and zoom of its other components.
+        """
         system, component = message.get_srcSystem(), message.get_srcComponent()
         state = self._readings.state
         if state.system_id is not None:
@@ -138,7 +144,7 @@ class VehicleTracker:
         return is_autopilot(message) and self._wanted_id in (None, system)
 
     def handle(self, message: Any, received_ns: int) -> bool:
-        """Process an accepted message; True if it shows that the flight controller rebooted."""
+        """Process an accepted message (old, impossible: only `ignored`); True after a reboot."""
         rebooted = False
         stamp_ns = received_ns
         boot_ns = boot_time_ns(message)

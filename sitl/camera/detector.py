@@ -32,7 +32,7 @@ class Observed(Protocol):
 
 @dataclass(frozen=True)
 class FixedPoint:
-    """A point that stays where it is. position: (3,) world metres."""
+    """A point that stays where it is. position: (3,) m, map ENU."""
 
     name: str
     position: Array

@@ -43,7 +43,9 @@ class Sensor:
         self._noise = self._rng.standard_normal(_NOISE_SIZE, dtype=np.float32)
 
     def apply(self, rgb: Image, depth: Float32, blur_px: float, blur_deg: float) -> Image:
-        """The camera's image (H, W, 3) of a rendered one; depth: (H, W) m, 0 for sky."""
+        """The camera's image (H, W, 3) of a rendered one. depth: (H, W) m, 0 for sky. blur_px,
+        blur_deg: length and direction of the image motion.
+        """
         a = replace(self._appearance, motion_blur_px=blur_px, motion_blur_deg=blur_deg)
         if not self._auto:
             return self._developed(rgb, depth, a)

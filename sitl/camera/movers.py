@@ -40,7 +40,7 @@ class Mover:
         return self._point(self._travelled(time_ns))
 
     def velocity_at(self, time_ns: int) -> Array:
-        """(3,) metres per second."""
+        """Velocity (3,) m/s, in the axes of `path`."""
         return self.speed_mps * self._direction(self._travelled(time_ns))
 
     def pose_at(self, time_ns: int) -> Pose:

@@ -29,7 +29,7 @@ def traffic(
     epoch_ns: int = 0,
 ) -> tuple[Mover, ...]:
     """Place moving cars (names ``car0``...) and people (``person0``...) on the world's main roads
-    and pavements.
+    and pavements; () without roads.
 
     frame: the map's ENU, of all positions. The same arguments give the same traffic.
     """

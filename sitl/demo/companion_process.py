@@ -81,7 +81,7 @@ def write_deployment(
     vehicle: VehicleProcess,
     ports: Ports,
 ) -> Path:
-    """Write the flight's deployment file for `companion run`, as an operator would."""
+    """Write ``companion.yaml`` for `companion run` into the existing folder; returns its path."""
     camera = scenario.camera.camera()
     config: dict[str, Any] = {
         "map": str(assets.map_cache.resolve()),
@@ -133,8 +133,8 @@ def _known_to(scenario: Scenario) -> dict[str, float]:
 def running_companion(
     config: Path, folder: Path, *options: str, program: Sequence[str] = THIS_PROGRAM
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Context manager: ``companion run`` as a process; interrupted (SIGINT) at the end. `folder`
-    receives its log.
+    """Context manager: ``companion run`` as a process; at the end SIGINT, after 20 s SIGKILL.
+    `folder` exists and receives its log.
 
     program: the command line before ``run``; options: after the configuration.
     """

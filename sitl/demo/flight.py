@@ -95,7 +95,8 @@ def fly(
     observers: FlightObservers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
 ) -> DemoRecord:
-    """Fly a scenario without GNSS. `folder` receives all records, also those of an aborted flight.
+    """Fly a scenario without GNSS. `folder` receives all records, also those of an aborted flight,
+    whose cause is in `DemoRecord.broken`. `SimulationError` if it fails before the mission.
 
     program: command line that starts the companion. observers: None: nothing is reported.
     """

@@ -110,7 +110,9 @@ class _Tables:
 
 
 def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightReport:
-    """Compute a flight's figures and write report.json and frames_report.csv to its folder."""
+    """Compute a flight's figures from its folder, and write report.json and frames_report.csv
+    there. `ReportError` if the companion's tables are missing.
+    """
     folder, span = record.folder, record.denied_ns
     tables = _Tables.read(folder)
     truth, estimates, targets, vehicle = (

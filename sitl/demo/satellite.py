@@ -89,8 +89,9 @@ def build_satellite_map(
     out: Path,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> None:
-    """Make a satellite mosaic of the world in the cache `seen`, and import it over the world's
-    bare-earth terrain as a tile cache at `out`. progress: called with the share done.
+    """Make a satellite mosaic of the world as the tile cache `seen` shows it, and import it over
+    the world's bare-earth terrain as a tile cache at `out`. progress: called with the mosaic's
+    share done.
     """
     cache = TileCache.open(seen)
     zone = int((world.origin.longitude_deg + 180) // 6) + 1

@@ -53,7 +53,10 @@ class FlightScript:
         """When GNSS went off, CLOCK_MONOTONIC; None before."""
 
     def fly(self) -> tuple[int, int]:
-        """Fly the mission; returns the span from GNSS off to the last waypoint, CLOCK_MONOTONIC."""
+        """Wait for the companion, take off and fly the mission (`land`: and land). The span from
+        GNSS off to the last waypoint, CLOCK_MONOTONIC ns. `FlightError` or `PilotError` if it is
+        aborted.
+        """
         pilot, scenario = self._pilot, self._scenario
         self._progress("starting the companion", 0.0)
         self.await_companion()
@@ -115,8 +118,8 @@ class FlightScript:
         self._pilot.land(_LANDING_TIMEOUT_S)
 
     def await_companion(self) -> None:
-        """Wait on the ground until the companion localizes; the first start on a machine compiles
-        for a minute or more. `FlightError` after a timeout.
+        """Wait on the ground for the companion's first health report; the first start on a machine
+        compiles for a minute or more. `FlightError` after 300 s, or if it ends.
         """
         started = time.monotonic()
         while self._health() is None:
@@ -151,7 +154,7 @@ class FlightScript:
 
 
 def mission(scenario: Scenario, home: Location) -> list[MissionStep]:
-    """Mission items of the scenario's legs: a gimbal command and a waypoint each."""
+    """Mission items of a scenario: the speed, then for each leg a gimbal command and a waypoint."""
     steps = [speed_step(scenario.speed_m_s)]
     for leg in scenario.legs:
         place = home.offset(leg.north_m, leg.east_m, 0.0)

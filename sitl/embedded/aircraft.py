@@ -128,7 +128,9 @@ class Aircraft:
     # --- physics and sensors -----------------------------------------------------------------
 
     def wind(self) -> Array:
-        """Wind (3,) NED m/s: mean (SIM_WIND_*), weaker near the ground, plus first-order gusts."""
+        """Wind (3,) NED m/s of the next tick, whose gusts each call advances: mean (SIM_WIND_*),
+        weaker near the ground, plus first-order gusts.
+        """
         p = self.parameters
         keep = exp(-TICK_S / _GUST_CORRELATION_S)
         self._gust *= keep

@@ -32,7 +32,9 @@ class Connection:
         self._send_lock = threading.Lock()
 
     def open(self, deadline: float, alive: Callable[[], None]) -> None:
-        """Connect, retrying until `deadline` (time.monotonic()); `PilotError` after it."""
+        """Connect, retrying until `deadline` (time.monotonic()); `PilotError` after it. alive:
+        raises if the vehicle has died.
+        """
         while self._link is None:
             alive()
             try:
@@ -53,7 +55,7 @@ class Connection:
         disable_reconnect(self._link)
 
     def shut_down(self) -> None:
-        """Wake and end the receiving thread."""
+        """Shut the socket down, so that a waiting `receive` returns; `close` comes later."""
         if self._link is not None:
             with contextlib.suppress(OSError):  # the vehicle may have closed it
                 self._link.port.shutdown(socket.SHUT_RDWR)

@@ -64,7 +64,7 @@ class GroundLink:
     # --- life --------------------------------------------------------------------------------
 
     def connect(self, timeout_s: float = 90.0) -> None:
-        """Connect, wait for the autopilot's heartbeat and ask for its streams."""
+        """Connect, ask for streams, await heartbeat and true state; `PilotError` without one."""
         deadline = time.monotonic() + timeout_s
         self._connection.open(deadline, self._alive)
         self._thread = threading.Thread(target=self._read, name="pilot", daemon=True)
@@ -91,7 +91,7 @@ class GroundLink:
     # --- waiting -----------------------------------------------------------------------------
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Block until a condition holds; PilotError after timeout_s simulated seconds."""
+        """Block until a condition holds; PilotError, naming `what`, after simulated timeout_s."""
         if not self._wait(condition, timeout_s):
             texts = "; ".join(t.text for t in self.record.texts[-4:])
             raise PilotError(
@@ -188,7 +188,7 @@ class GroundLink:
             raise PilotError(f"command {number} was refused (MAV_RESULT {result}): {texts}")
 
     def try_command(self, number: int, *parameters: float) -> int | None:
-        """Send COMMAND_LONG; returns its MAV_RESULT, or None without an answer."""
+        """Send COMMAND_LONG; returns its MAV_RESULT, or None without an answer in two minutes."""
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         with self.answers.expect("COMMAND_ACK") as box:
             for attempt in range(_TRIES):

@@ -20,14 +20,14 @@ class MissionStep:
 
 
 def takeoff_step(height_m: float) -> MissionStep:
-    """Climb to a height above home."""
+    """Item: climb to a height above home."""
     return MissionStep(mavlink.MAV_CMD_NAV_TAKEOFF, altitude_m=height_m)
 
 
 def waypoint_step(
     latitude_deg: float, longitude_deg: float, height_m: float, hold_s: float = 0.0
 ) -> MissionStep:
-    """Fly to a position at a height above home."""
+    """Item: fly to a position at a height above home, and stay hold_s."""
     return MissionStep(
         mavlink.MAV_CMD_NAV_WAYPOINT,
         (hold_s, 0.0, 0.0, 0.0),
@@ -38,12 +38,12 @@ def waypoint_step(
 
 
 def speed_step(speed_m_s: float) -> MissionStep:
-    """Change the ground speed."""
+    """Item: change the ground speed."""
     return MissionStep(mavlink.MAV_CMD_DO_CHANGE_SPEED, (1.0, speed_m_s, -1.0, 0.0))
 
 
 def gimbal_step(pitch_deg: float, yaw_deg: float) -> MissionStep:
-    """Point the gimbal; yaw from the vehicle's nose."""
+    """Item: point the gimbal; pitch from the horizon, up positive, yaw from the nose."""
     return MissionStep(
         mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
         (pitch_deg, yaw_deg, 0.0, 0.0),
@@ -52,5 +52,5 @@ def gimbal_step(pitch_deg: float, yaw_deg: float) -> MissionStep:
 
 
 def return_step() -> MissionStep:
-    """Return to launch and land."""
+    """Item: return to launch and land."""
     return MissionStep(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)

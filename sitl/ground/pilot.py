@@ -62,7 +62,9 @@ class Pilot:
             self.link.set_speed(normal)
 
     def wait_ready(self, timeout_s: float = 120.0) -> None:
-        """Wait until the EKF has a position and the vehicle would arm in GUIDED."""
+        """Wait for an EKF position, change to GUIDED, wait for the pre-arm checks there, and read
+        the EKF origin. `PilotError` after timeout_s each.
+        """
         self.link.wait(self._has_position, timeout_s, "an EKF position")
         self.set_mode("GUIDED")
         bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
@@ -105,7 +107,7 @@ class Pilot:
         self.link.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
 
     def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
-        """Take off in GUIDED; returns when the true height above the ground is height_m - 2 m."""
+        """Take off, armed in GUIDED; returns at a true height above ground of height_m - 2 m."""
         ground = self.record.truth.altitude_m
         self._ground_m = ground
         height = height_m + ground if self.record.is_px4 else height_m  # PX4: AMSL
@@ -165,7 +167,7 @@ class Pilot:
         self.link.set_parameter("SIM_GPS1_ENABLE", 1.0 if on else 0.0)
 
     def use_source_set(self, number: int) -> None:
-        """Order an EKF source set, 1 to 3 (MAV_CMD_SET_EKF_SOURCE_SET)."""
+        """Order an EKF source set, 1 to 3; `PilotError` unless the vehicle accepts it."""
         self.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
     def set_origin(self, origin: Location) -> None:
@@ -184,14 +186,16 @@ class Pilot:
             raise PilotError("the vehicle took no EKF origin")
 
     def read_origin(self) -> Location | None:
-        """The EKF origin; None while there is none."""
+        """Request the EKF origin; returns the newest one received, None without any."""
         self.link.try_command(
             mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
         )
         return self.record.origin
 
     def point_gimbal(self, pitch_deg: float, yaw_deg: float, *, earth_yaw: bool = False) -> None:
-        """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; yaw from the nose, or (earth_yaw) from north."""
+        """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; pitch up positive, yaw from nose or north
+        (earth_yaw).
+        """
         flags = _GIMBAL_YAW_LOCK if earth_yaw else 0.0
         self.link.command(
             mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
@@ -203,6 +207,8 @@ class Pilot:
         )
 
     def start_mission(self) -> None:
-        """Fly the uploaded mission in AUTO from its first step."""
+        """Change to AUTO, which flies the uploaded mission, and clear `record.reached`. The call
+        does not wait for the flight.
+        """
         self.record.reached.clear()
         self.set_mode("AUTO")

@@ -118,12 +118,14 @@ class LeastLatencyClock:
         self._offsets.append(received_ns - boot_ms * self._scale)
 
     def monotonic_ns(self, boot_ms: int) -> int:
-        """CLOCK_MONOTONIC at a boot time."""
+        """CLOCK_MONOTONIC at a boot time, once `observe` was called."""
         return round(boot_ms * self._scale + min(self._offsets, default=0.0))
 
 
 class SampleTrack(Generic[_Sample]):
-    """Samples in time order for one writing and many reading threads."""
+    """Samples in time order for one writing and many reading threads. It keeps the newest `limit`
+    to 2 `limit` of them.
+    """
 
     def __init__(self, limit: int) -> None:
         self._lock = threading.Lock()
@@ -132,7 +134,7 @@ class SampleTrack(Generic[_Sample]):
         self._limit = limit
 
     def add(self, sample: _Sample) -> None:
-        """Append a sample that is newer than the last."""
+        """Append a sample; one that is not newer than the last is dropped."""
         with self._lock:
             if self._times and sample.time_ns <= self._times[-1]:
                 return

@@ -49,7 +49,7 @@ class Chase:
         return tuple(spans)
 
     def begins_ns(self) -> int:
-        """Time at which the car is clicked."""
+        """CLOCK_MONOTONIC time at which the car is where it is clicked."""
         return self.car.epoch_ns + round((self.begin_m - self.car.phase_m) / SPEED_MPS * 1e9)
 
 

@@ -65,8 +65,8 @@ class FollowRow:
 
 
 def fly_follows(options: RunOptions, world: int) -> tuple[FollowRow, ...]:
-    """Fly a car-following flight for each seed; results are written to ``out/follow.json`` after
-    each. world: seed of the world.
+    """Fly a car-following flight on each vehicle with each of `options.seeds`, which draw car and
+    errors; results are written to ``out/follow.json`` after each. world: seed of the world.
     """
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[FollowRow] = []

@@ -74,13 +74,13 @@ class Pursuer:
         self.late_s = 0.0
 
     def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
-        """The car and the roofs that hide it."""
+        """The car and the roofs that hide it; sets `chase`, which `take_part` needs."""
         self.chase = make_chase(self._assets.world, self._frame, epoch_ns, LEAD_S, self._seed)
         return self.chase.movers
 
     @contextmanager
     def take_part(self, context: ParticipantContext) -> Iterator[None]:
-        """Context manager: follow the car and click it during the flight."""
+        """Context manager: follow the car and click it in a thread; its errors go to `failure`."""
         thread = threading.Thread(target=self._run, args=(context,), name="pursuer")
         thread.start()
         try:

@@ -21,7 +21,9 @@ _TRIES = 4
 
 
 class Station:
-    """A MAVLink client in the caller's thread. alive: as of `GroundLink`."""
+    """A MAVLink client in the caller's thread. It connects when it is made; `PilotError` if nothing
+    listens for 30 s. alive: as of `GroundLink`.
+    """
 
     def __init__(self, endpoint: str, alive: Callable[[], None] = lambda: None) -> None:
         self._link = Connection(endpoint)

@@ -38,7 +38,7 @@ class Rehearsal:
 
 def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Scenario) -> Rehearsal:
     """Prepare a flight over the tile cache `cache`. live: the cache that the camera sees; None: the
-    same.
+    same. `ScenarioError` if the mission is invalid or not over the map.
 
     The scenario's weather, camera and errors are kept. Its legs are replaced by the mission's, or
     without a mission by a triangle about the map's centre.

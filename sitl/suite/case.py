@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -25,6 +25,7 @@ from sitl.vehicles.launch import (
 )
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
+AnyCase = TypeVar("AnyCase", bound=StrictModel)
 
 
 class VehicleSpec(StrictModel):
@@ -159,13 +160,13 @@ class Case(StrictModel):
         return FixModel.model_validate({**model.model_dump(), **event.fixes})
 
 
-def load_case(path: Path) -> Case:
+def load_case(path: Path, model: type[AnyCase]) -> AnyCase:
     """Read a scenario file; ScenarioError names the file and every problem in it."""
     data = read_settings(path, ScenarioError)
     if "name" in data:
         raise ScenarioError(f"{path}: name: a scenario is named by its file, leave it out")
     try:
-        return validated(Case, {"name": path.stem, **data})
+        return validated(model, {"name": path.stem, **data})
     except SettingsError as error:
         raise ScenarioError(f"{path}:\n{error}") from error
 
@@ -181,4 +182,4 @@ def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Cas
         raise ScenarioError(
             f"no scenario {', '.join(unknown)} in {folder}; there are: {', '.join(files)}"
         )
-    return tuple(load_case(files[name]) for name in chosen)
+    return tuple(load_case(files[name], Case) for name in chosen)

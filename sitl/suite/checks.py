@@ -162,9 +162,7 @@ class TextExpectation(_Span):
         times = [
             t.at_s
             for t in record.texts
-            if t.sender == "vehicle"
-            and self.contains in t.text
-            and self.from_s <= t.at_s <= self.to_s
+            if not t.is_ours and self.contains in t.text and self.from_s <= t.at_s <= self.to_s
         ]
         said = f"{times[0]:.1f} s" if times else "never"
         return ExpectationResult(bool(times) != self.absent, f"vehicle: '{self.contains}' {said}")
@@ -188,8 +186,8 @@ class AlertExpectation(_Span):
         """Compare the texts of a flight with the expectation."""
         times = [
             t.at_s for t in texts
-            if t.alert is self.alert
-            and self.values.items() <= t.values.items()
+            if t.raised is not None and t.raised[0] is self.alert
+            and self.values.items() <= t.raised[1].items()
             and self.from_s <= t.at_s <= self.to_s
         ]  # fmt: skip
         said = f"{times[0]:.1f} s" if times else "never"
@@ -215,7 +213,7 @@ class ErrorAlertExpectation(_Span):
         told = [
             t.at_s
             for t in record.texts
-            if t.alert is not None and CATALOGUE[t.alert].action and t.at_s >= self.from_s
+            if t.raised is not None and CATALOGUE[t.raised[0]].action and t.at_s >= self.from_s
         ]
         said = f"reported at {told[0]:.1f} s" if told else "never reported"
         if not beyond:
@@ -235,7 +233,7 @@ class NoWarningExpectation(_Span):
         heard = [
             t.text
             for t in record.texts
-            if t.sender == "vehicle"
+            if not t.is_ours
             and self.from_s <= t.at_s <= self.to_s
             and any(word in t.text for word in self.words)
         ]

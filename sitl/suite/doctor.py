@@ -22,7 +22,8 @@ class DoctorError(SimulationError):
 
 
 def run_doctor(config: BridgeConfig) -> Doctor:
-    """Run the doctor, `companion doctor --fix --yes`, and the doctor again.
+    """Run the doctor, `companion doctor --fix --yes`, which writes the vehicle's parameters, and
+    the doctor again. `DoctorError` if nothing was written.
 
     The exit codes are those of the flight controller's checks, because a suite has neither map nor
     camera, which `companion doctor` would report as missing.

@@ -25,7 +25,6 @@ from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessErr
 
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID_M = 47.3
-_AUTOPILOT = 1
 _GYROS_SETTLED_S = 27.0  # ArduPilot SITL refuses to arm before about 25 s
 _SETTLE_S = 3.0
 _REBOOT_S = 60.0  # within which the ports of the next boot are open; a tenth of a second is usual
@@ -256,11 +255,7 @@ class _CaseFlight:
         """Add a pilot's EKF errors and texts to the record; each reboot makes a new pilot."""
         record = self._record
         record.texts += [
-            Text(
-                self._seconds(t.time_ns),
-                "vehicle" if t.component == _AUTOPILOT else "bridge",
-                t.text,
-            )
+            Text(self._seconds(t.time_ns), t.component, t.severity, t.text)
             for t in pilot.record.texts
         ]
         for sample, true in pilot.record.ekf_pairs():

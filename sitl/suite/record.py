@@ -12,31 +12,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.reading import values_of
+from mavlink_bridge.alerts.reading import alert_of, values_of
 from mavlink_bridge.messages import Figures
 
 Array = NDArray[np.float64]
+_AUTOPILOT = 1  # component id
+_WARNING = 4  # MAV_SEVERITY; lower is worse
 
 
 @dataclass(frozen=True)
 class Text:
-    """A STATUSTEXT. sender: "vehicle" or "bridge"."""
+    """A STATUSTEXT and the MAVLink component that sent it: the autopilot, or our processes."""
 
     at_s: float
-    sender: str
+    component: int
+    severity: int
     text: str
 
     @property
+    def is_ours(self) -> bool:
+        """Whether the bridge sent it, not the autopilot."""
+        return self.component != _AUTOPILOT
+
+    @property
     def alert(self) -> AlertId | None:
-        """The bridge's active alert in this text; None for others."""
-        read = values_of(self.text) if self.sender == "bridge" else None
+        """Our alert, raised or cleared; None for texts of the autopilot."""
+        read = alert_of(self.text) if self.is_ours else None
         return None if read is None else read[0]
 
     @property
-    def values(self) -> dict[str, str]:
-        """Values of the alert, as shown."""
-        read = values_of(self.text)
-        return {} if read is None else read[1]
+    def raised(self) -> tuple[AlertId, dict[str, str]] | None:
+        """Our active alert and its values as shown; None for others."""
+        return values_of(self.text) if self.is_ours else None
+
+    @property
+    def is_warning(self) -> bool:
+        """Whether it is a warning of ours, or worse."""
+        return self.is_ours and self.severity <= _WARNING
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class ReportRow:
     def monitor_alerts(self) -> tuple[str, ...]:
         """Alerts of the integrity monitor with their times, without the bridge's own."""
         texts = self.record.texts if self.record is not None else []
-        its = [t for t in texts if t.alert in _MONITORED]
+        its = [t for t in texts if t.raised is not None and t.raised[0] in _MONITORED]
         return tuple(f"{t.at_s:.1f} s: {t.text}" for t in its)
 
     @property

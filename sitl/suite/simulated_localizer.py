@@ -104,9 +104,10 @@ class FixSink(Protocol):
 
 
 class BridgeFeed:
-    """Submits fixes in a thread, in real time, until it is closed.
+    """Submits fixes in a thread, in real time, from when it is made until it is closed.
 
-    home: the map's origin, altitude AMSL; geoid_m: the map's geoid separation there.
+    pilot: gives the truth; may be replaced. home: the map's origin, altitude AMSL; geoid_m: the
+    map's geoid separation there.
     """
 
     def __init__(

@@ -50,7 +50,9 @@ def find_defaults(binary: Path) -> Path:
 
 
 class ArduPilotSitl(VehicleProcess):
-    """ArduCopter SITL at `home` (AMSL) with `parameters` over ArduPilot's defaults."""
+    """ArduCopter SITL at `home` (AMSL) with `parameters` over ArduPilot's defaults.
+    `ArduPilotNotFoundError` without its binary.
+    """
 
     kind = "ardupilot"
     start_timeout_s = 30.0

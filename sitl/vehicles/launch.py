@@ -164,13 +164,15 @@ def open_vehicle(
     home: Location,
     setup: VehicleSetup | None = None,
 ) -> VehicleProcess:
-    """Create a vehicle that is not started yet; "auto" is ArduPilot if its binary is found.
+    """Create a vehicle that is not started yet; "auto" is ArduPilot if its binary is found, except
+    for PX4. `VehicleProcessError` for PX4 on ArduPilot, or without its binary.
 
     home: altitude AMSL. setup: None: the defaults.
     """
     s = setup or VehicleSetup()
     if s.px4 and kind == "ardupilot":
         raise VehicleProcessError("a scenario of PX4 flies on the embedded vehicle: --fc embedded")
-    if kind == "ardupilot" or (kind == "auto" and find_arducopter() is not None):
+    found = kind == "auto" and not s.px4 and find_arducopter() is not None
+    if kind == "ardupilot" or found:
         return ArduPilotSitl(home, s.heading_deg, s.parameters, s.speedup, s.log)
     return EmbeddedSitl(home, s.heading_deg, s.parameters, s.speedup, s.seed, s.log, s.px4)

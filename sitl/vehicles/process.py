@@ -104,7 +104,7 @@ class VehicleProcess(ABC):
 
     @property
     def boots(self) -> int:
-        """Number of boots since the launch."""
+        """Number of boots since the last `start` or `restart`, by the log."""
         # The log is watched, as a probing connection would take the port's only client slot.
         marker = f"SERIAL2 on TCP port {_port(self._instance, _SPARE_OFFSET)}"
         return self.log_tail(_WHOLE_LOG).count(marker)

@@ -49,8 +49,7 @@ def refused(
         ("places table . --plot /no/such/folder/a.png", "/no/such/folder"),
         ("targets 0 --height 5", "--height"),
         ("throughput run . --widths 0", "--widths"),
-        ("tables", "--help"),
-        ("tables --targets /no/such.json", "/no/such.json"),
+        ("targets.by_height /no/such.json", "/no/such.json"),
     ],
 )
 def test_it_is_one_line(command, named, monkeypatch, capsys):
@@ -59,16 +58,8 @@ def test_it_is_one_line(command, named, monkeypatch, capsys):
     assert said.count("\n") == 1
 
 
-def test_so_it_is_of_the_training_pairs(monkeypatch, capsys):
-    pytest.importorskip("torch")
-    for command in ("pairs /no/such.yaml", f"pairs {__file__} --pairs 0"):
-        assert refused(command, monkeypatch, capsys).count("\n") == 1
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_explained(name, monkeypatch, capsys):
-    if name == "pairs":
-        pytest.importorskip("torch")
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     for loaded in (f"benchmarks.{name}", f"benchmarks.{name}.__main__"):  # runpy would warn
         monkeypatch.delitem(sys.modules, loaded, raising=False)

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.common.shares import wilson
 from benchmarks.features.report import (
     PairOutcome,
     difference,
     read_outcomes,
-    report,
-    wilson,
     write_outcomes,
 )
+from benchmarks.features.tables import report
 from localizer.errors import SequenceError
 
 
@@ -48,20 +48,19 @@ def test_outcomes_survive_the_file_and_make_a_table(tmp_path: Path) -> None:
     text = report(made)
     assert "| all | 4 | 50 [15, 85], 75 | 75 [30, 95], 75 |" in text
     assert "| night | 2 | 100 " in text
+    assert "| median error |  | 1.25 m, 0.10° | 0.70 m, 0.10° |" in text
     assert "| all | 4 | +25.0 [" in text
 
 
-def test_where_a_method_is_behind_is_said_with_its_certainty() -> None:
+def test_leads_are_told_by_set_and_by_kind() -> None:
     # Set x: b misses all that a finds. Set y: as good, but for one place of many.
     near, far, mixed = [0.5] * 40, [2.0] * 40, [2.0] + [0.5] * 39
     made = outcomes("a", near, "x") + outcomes("a", near, "y")
     text = report(made + outcomes("b", far, "x") + outcomes("b", mixed, "y"))
-    assert "| x: all | 40 | -100.0 [-100.0, -100.0] **behind** |" in text
-    assert "- x: day: a, -100.0 [-100.0, -100.0], significant" in text
-    assert "- y: all: a, -2.5 [-7.5, +0.0], not significant" in text
-    assert "y: day: a" not in text
-    assert "in 0 of" not in text
-    assert "b is behind in 0 of these cells" in report(outcomes("a", near) + outcomes("b", near))
+    assert "| x | 40 | -100.0 [-100.0, -100.0] |" in text
+    assert "| y | 40 | -2.5 [-7.5, +0.0] |" in text
+    assert "| day | 40 | -50.0 [" in text
+    assert "lead of" not in report(made)
 
 
 @pytest.mark.parametrize("text", ["", "a,b\n1,2\n", "method,source\nours,made\n"])

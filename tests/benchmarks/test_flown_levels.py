@@ -80,7 +80,7 @@ def test_a_withheld_position_that_is_wrong_spoils_no_share() -> None:
     counted = share([good, late], injected=True)
     assert counted is not None
     assert (counted.flights, counted.flights_whole, counted.within_hpl) == (2, 1, 3)
-    assert counted.low < 0.75 < counted.high
+    assert counted.low < 75.0 < counted.high
 
 
 def test_what_cannot_be_counted_is_named_and_the_rest_is_written(tmp_path, monkeypatch, capsys):

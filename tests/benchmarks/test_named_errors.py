@@ -34,7 +34,7 @@ for name in sys.argv[1:]:
     except SystemExit as end:
         print(name, end.code)
 """
-NEED_TORCH = ["pairs"]  # and two more, whose other imports take seconds
+NEED_TORCH = ["integrity"]  # and others, whose other imports take seconds
 
 
 def test_a_benchmark_that_needs_torch_says_so() -> None:

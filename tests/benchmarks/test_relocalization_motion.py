@@ -8,7 +8,8 @@ import pytest
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.relocalization.counted import cells, one
-from benchmarks.relocalization.motion import TrialOutcome, share, shares, table
+from benchmarks.relocalization.motion import TrialOutcome, share, shares
+from benchmarks.relocalization.motion import cells as motion_cells
 
 FOUND = TrialOutcome(
     "generated", 0, "day", True, True, True, 90.0, searches=1, found_at=1, wrong=0,
@@ -43,7 +44,7 @@ def test_shares_have_exact_intervals():
     assert share(0, 1000) == {"hits": 0, "count": 1000, "low": 0.0, "high": pytest.approx(high)}
     assert high == pytest.approx(0.368, abs=1e-3)
     assert low == 0.0
-    assert "0 [0.0, 97.5]" in table(shares([FOUND]))
+    assert "0 [0.0, 97.5]" in motion_cells(shares([FOUND]))[-1]
 
 
 def test_all_relocalizations_are_counted_together_and_a_false_one_shows():

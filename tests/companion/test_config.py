@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
-from companion.settings_file import nested_models, settings
+from companion.settings_file import nested_models, settable_fields
 from mavlink_bridge import BridgeConfig
 from tests.bounds import unbounded
 
@@ -24,12 +24,15 @@ def _write(tmp_path: Path, data: object) -> Path:
 
 
 def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
-    given = {"record": {"folder": "out"}, "state_dir": "state"}
+    targets = {"detector": {"model": "cars.onnx"}}
+    given = {"record": {"folder": "out"}, "state_dir": "state", "targets": targets}
     config = load_config(_write(tmp_path, MINIMAL | given))
     assert config.map == tmp_path / "cache"
     assert config.record is not None
     assert config.record.folder == tmp_path / "out"
     assert config.state_folder == tmp_path / "state"
+    assert config.targets.detector is not None
+    assert config.targets.detector.model == tmp_path / "cars.onnx"
     assert config.camera.model.camera().fx == 550
 
 
@@ -149,7 +152,7 @@ DEPLOYMENT = Path(__file__).parents[2] / "configs" / "deployment.yaml"
 
 def _keys(model: type[BaseModel], where: str = "") -> Iterator[tuple[str, ...]]:
     """Paths of all keys of a configuration, those of nested and optional models, too."""
-    for name, field in settings(model).items():
+    for name, field in settable_fields(model).items():
         yield (*filter(None, where.split(".")), name)
         for nested in nested_models(field.annotation):
             yield from _keys(nested, f"{where}{name}.")
@@ -204,7 +207,7 @@ def test_the_deployment_file_shows_the_defaults_or_says_so():
     default = BridgeConfig()
     for part in ("injection", "switch", "rc", "camera", "targets"):
         shown, kept = getattr(config.bridge, part), getattr(default, part)
-        for name in settings(type(shown)):
+        for name in settable_fields(type(shown)):
             if getattr(shown, name) != getattr(kept, name):
                 assert f"default {getattr(kept, name):g}" in text.split(f" {name}:", 1)[1][:80], (
                     name

@@ -164,7 +164,7 @@ def test_orders_of_other_systems_are_denied_and_told_once(monkeypatch, command, 
     orders = Orders(monkeypatch)
     for _ in range(3):
         assert orders.command(66, command, component) == [mavlink.MAV_RESULT_DENIED]
-    assert not orders.enable.open
+    assert not orders.enable.enabled
     told = orders.flight.told(AlertId.SENDER_REFUSED)
     assert told == [alert(AlertId.SENDER_REFUSED, system=66, why=SenderRefusal.NOT_ALLOWED)]
     assert orders.command(66, mavlink.MAV_CMD_REQUEST_MESSAGE, 100) != []  # a question
@@ -173,7 +173,7 @@ def test_orders_of_other_systems_are_denied_and_told_once(monkeypatch, command, 
 def test_the_ground_stations_order_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     orders = Orders(monkeypatch)
     assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
-    assert orders.enable.open
+    assert orders.enable.enabled
     second = Orders(monkeypatch, ground_systems=(254, 66))
     assert second.command(66, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
 
@@ -187,7 +187,7 @@ def test_with_signing_an_unsigned_ground_link_gives_no_orders(monkeypatch, tmp_p
     assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_DENIED]
     refused = alert(AlertId.SENDER_REFUSED, system=255, why=SenderRefusal.NOT_SIGNED)
     assert refused in orders.flight.alerts
-    assert not orders.enable.open
+    assert not orders.enable.enabled
 
 
 def test_state_files_of_two_links_differ(tmp_path: Path) -> None:

@@ -361,7 +361,7 @@ def test_a_gate_that_chatters_ends_as_the_channel_stands(monkeypatch: pytest.Mon
         pulses = [0, 65535, 1, 1900][turn % 4]
         enable.on_rc_channels([pulses] * 18)
         enable.command(mavlink.MAV_CMD_USER_1, (math.nan, math.inf, 0.5, -1.0)[turn % 4])
-    assert enable.open
+    assert enable.enabled
 
 
 def test_no_flood_of_clicks_ends_the_targets_that_are_followed(flight: Flight) -> None:

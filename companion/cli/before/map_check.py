@@ -40,7 +40,7 @@ def check_command(
     from companion.config import load_config
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.check import MapUse, check_map
-    from localizer.map.inspection.inspect import write_picture
+    from localizer.pictures import write_rgb
     from localizer.tracking.pipeline import working_camera
 
     pixel_rad, half_view_deg = 2 * math.tan(math.radians(fov) / 2) / width, fov / 2
@@ -53,7 +53,7 @@ def check_command(
     with show_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
         made = check_map(opened, MapUse(height, pixel_rad, half_view_deg))
     for name, rgb in made.pictures.items():
-        write_picture(out / f"{name}.png", rgb)
+        write_rgb(out / f"{name}.png", rgb)
     table = Table(box=SIMPLE_HEAD)
     for column in ("", "what", "found", "meaning"):
         table.add_column(column, overflow="fold")

@@ -58,7 +58,7 @@ def plan_command(
     from companion.preflight.map_pin import map_hash
     from localizer.forecast.visit import FORECAST_CONDITIONS
     from localizer.map.cache.cache import TileCache
-    from localizer.map.inspection.inspect import write_picture
+    from localizer.pictures import write_rgb
 
     conditions = tuple(dict.fromkeys(condition or ["day"]))
     unknown = [c for c in conditions if c not in FORECAST_CONDITIONS]
@@ -79,14 +79,14 @@ def plan_command(
         plan = make_plan(planned, cache, deployment, question, count)
     camera = deployment.camera.model.camera().without_distortion()
     with show_work(Console(stderr=True), "drawing the pictures"):
-        sheet = pictures.sheet_of(plan, cache)
+        sheet = pictures.render_map_square(plan, cache)
         aim = aim_of(deployment, pitch)
         shown = (
             ("Track", pictures.track_picture(sheet, plan)),
             ("Ground that is seen", pictures.heat_picture(sheet, plan, cache, camera, aim)),
         )
     for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
-        write_picture(out / name, rgb)
+        write_rgb(out / name, rgb)
     page.write_page(plan, shown, out / "plan.html")
     legs = () if frames is None else check.flown_legs(plan.verdicts, *frames)
     document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}

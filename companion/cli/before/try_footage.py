@@ -74,7 +74,7 @@ def _print_map(flight: RecordedFlight) -> None:
     wanted = wanted_map(flight)
     out = Console()
     out.print(
-        f"{len(flight.frames)} frames, {flight.located} with a position; no map is given. "
+        f"{len(flight.frames)} frames, {flight.located_count} with a position; no map is given. "
         f"{wanted.sentence}.",
         soft_wrap=True, highlight=False,
     )  # fmt: skip

@@ -66,7 +66,9 @@ def layout_of(
 
 
 def decode(output: NDArray[np.float32], layout: Layout, threshold: float) -> list[Box]:
-    """Boxes of at least the score `threshold`, best first, after non-maximum suppression."""
+    """Boxes of at least the score `threshold`, best first, after non-maximum suppression; at most
+    64. output: as of the layout; pixels of the network's input.
+    """
     rows = output[0].T if layout == "v8" else output[0]
     if layout == "end2end":
         corners, scores, labels = rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64)

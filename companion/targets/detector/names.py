@@ -68,8 +68,8 @@ class ObjectNames:
         self._count: dict[str, int] = {}
 
     def name(self, sights: list[LocatedBox], time_ns: int) -> list[str | None]:
-        """A name for each box of the frame exposed at time_ns; None for an object seen for the
-        first time, which may be a false detection.
+        """A name for each box (`sights`) of the frame exposed at time_ns; None for an object seen
+        for the first time, which may be a false detection. Call it in time order: it learns.
         """
         self._things = [t for t in self._things if time_ns - t.time_ns <= _KEPT_NS]
         names: list[str | None] = [None] * len(sights)

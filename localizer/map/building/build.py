@@ -37,12 +37,15 @@ def build_cache(
     progress: Progress | None = None,
     name: str | None = None,
 ) -> Manifest:
-    """Import a map source into a tile cache at `out`.
+    """Import a map source into a tile cache at `out`, which must not exist unless `overwrite` is
+    set.
 
-    An interrupted build continues.
+    An interrupted build continues; an error leaves `out` as it was (`MapSourceError`,
+    `GeoreferenceError` or `MapCacheError`).
 
-    source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder with
-    one of these. progress: called with the number of imported tiles and of all tiles.
+    source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder with one
+    of these. progress: called with the number of imported tiles and of all tiles.
+
     name: of the source, in errors and in the manifest; None: its files.
     """
     options = options or BuildOptions()

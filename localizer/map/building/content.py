@@ -43,7 +43,8 @@ def require_in_volumes(
     rules: ImportRules,
 ) -> list[str]:
     """Warnings if content is outside the bounding volumes of its tileset; `MapSourceError` if most
-    of it is. nodes: ECEF corners (8, 3) of each volume, and its tiles.
+    of it is, unless the user accepts this. nodes: ECEF corners (8, 3) of each volume, and its
+    tiles. lift_m: what was added to the heights.
     """
     area = inside = worst = 0.0
     count = beyond = 0

@@ -52,7 +52,7 @@ def _repacked(mesh: SourceMesh) -> SourceMesh:
     np.maximum.at(high, chart, texels)
     low = np.clip(np.floor(low) - _PADDING, 0, size).astype(np.int64)
     high = np.clip(np.ceil(high) + _PADDING, 0, size).astype(np.int64)
-    places, (width, height) = shelves(high - low)
+    places, (width, height) = pack_in_rows(high - low)
     if width * height >= size.prod():
         return mesh
     image = np.zeros((height, width, 3), np.uint8)
@@ -62,7 +62,7 @@ def _repacked(mesh: SourceMesh) -> SourceMesh:
     return replace(mesh, uvs=uvs.astype(np.float32), image=image)
 
 
-def shelves(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[int, int]]:
+def pack_in_rows(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """Pack rectangles (N, 2: width, height) in rows; positions (N, 2) and total size."""
     limit = max(int(np.sqrt(1.1 * sizes.prod(axis=1).sum())), int(sizes[:, 0].max()))
     places = np.zeros_like(sizes)

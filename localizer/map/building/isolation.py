@@ -25,8 +25,9 @@ _NO_DRIVERS = "HTTP,WMS,WCS,WMTS,WFS,OAPIF,OGCAPI,DAAS,EEDAI,PLMOSAIC,STACTA,STA
 def call_in_process(
     function: Callable[..., _Result], *args: object, rules: ImportRules, what: str
 ) -> _Result:
-    """Call a function in its own process; returns its result or raises its exception.
-    `MapSourceError` if the process died or was too slow. what: for that message.
+    """Call a function in its own process with the limits of `rules`; returns its result or raises
+    its exception. Function, arguments and result are pickled. `MapSourceError` if the process died
+    or was too slow. what: for that message.
     """
     context = multiprocessing.get_context("spawn")  # OpenCV's threads do not survive a fork
     here, there = context.Pipe(duplex=False)
@@ -80,7 +81,9 @@ def _answer(
 
 
 def confine(rules: ImportRules) -> None:
-    """Limit this process's memory, disable GDAL's network access, and end with the parent."""
+    """Limit this process's memory, disable GDAL's network access, and end with the parent, for the
+    rest of its life.
+    """
     os.environ["GDAL_SKIP"] = _NO_DRIVERS
     with open("/proc/self/statm") as statm:
         used = int(statm.read().split()[5]) * _PAGE  # data and stacks

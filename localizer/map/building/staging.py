@@ -85,7 +85,9 @@ class Staging:
         return self.folder / "parts" / f"{key // 1000:04d}" / f"{key:07d}-{part}.safetensors"
 
     def store(self, key: int, meshes: list[SourceMesh]) -> TileRecord:
-        """Write a source tile's meshes (positions: ENU metres) and then its record."""
+        """Write a source tile's meshes (positions: ENU metres) and then its record. `MapCacheError`
+        if that fails.
+        """
         self.tile_path(key, 0).parent.mkdir(parents=True, exist_ok=True)
         tiles = []
         for part, mesh in enumerate(meshes):
@@ -214,7 +216,9 @@ def texel_size(
     faces: NDArray[np.int32],
     size: tuple[int, int],
 ) -> float:
-    """Metres per texel over a mesh's surface. size: (width, height) of its texture."""
+    """Metres per texel over a mesh's surface; 0 if its texture has no area. size: (width, height)
+    of the texture.
+    """
     p, t = positions[faces], uvs[faces].astype(np.float64) * size
     area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=-1).sum()
     a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]

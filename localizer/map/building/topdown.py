@@ -36,8 +36,9 @@ def tile_error_m(size: float) -> float:
 def render_height_field(
     groups: Iterable[Sequence[Textured]], left: float, top: float, size: float
 ) -> list[SourceMesh]:
-    """Render the meshes of a square (metres, z up) from above as one textured height field. groups:
-    rendered one after the other to save memory. left, top: western and northern edge; size: side.
+    """Render the meshes of a square (metres, z up) from above as one textured height field; empty
+    without a surface there. groups: rendered one after the other to save memory. left, top: western
+    and northern edge; size: side.
     """
     step = size / CELLS
     heights = np.full((CELLS + 1, CELLS + 1), -np.inf)

@@ -46,8 +46,8 @@ class ImportJob:
         return self.staged.store(key, meshes)
 
     def run_in_time(self, key: int, tile: TileSource) -> TileRecord:
-        """Call `run` in a process of a pool, which is killed at the time limit: a hanging decoder
-        cannot be stopped otherwise.
+        """`run`, for a process of a pool only: its alarm kills the process at the time limit,
+        because a hanging decoder cannot be stopped otherwise.
         """
         signal.setitimer(signal.ITIMER_REAL, self.rules.seconds)
         try:
@@ -90,9 +90,9 @@ def tiles_of(root: SourceNode) -> Iterator[TileSource]:
 def import_all(
     root: SourceNode, job: ImportJob, workers: ImportWorkers, progress: Progress
 ) -> dict[int, TileRecord]:
-    """Records of every source tile, by its place in `tiles_of` order. progress: called in the
-    caller's thread with the number of finished tiles and of all tiles. `MapSourceError` if no tile
-    has content.
+    """Records of every source tile, by its place in `tiles_of` order. Tiles that an interrupted
+    build imported are not imported again. progress: called in the caller's thread with the number
+    of finished tiles and of all tiles. `MapSourceError` if no tile has content.
     """
     records: dict[int, TileRecord] = {}
     todo: list[tuple[int, TileSource]] = []

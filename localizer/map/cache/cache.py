@@ -147,7 +147,9 @@ class TileCache:
 
     @classmethod
     def open(cls, path: Path) -> TileCache:
-        """Open a cache folder; raises `MapCacheError` when it is missing, corrupt or too new."""
+        """Open a cache folder. `MapCacheError` if it is missing, corrupt, or of another format
+        version. A tile is checked only when it is loaded.
+        """
         path = Path(path)
         manifest = read_manifest(path)
         try:

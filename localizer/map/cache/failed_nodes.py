@@ -36,7 +36,9 @@ class FailedNodes:
         return len(self._failures)
 
     def add(self, node: int, error: MapCacheError) -> None:
-        """Record a failed read of a node; each further failure delays its retry longer."""
+        """Record a failed read, and log a node's first; each further one delays its retry
+        longer.
+        """
         before = self._failures.get(node)
         if before is None:
             _log.error("%s", error)

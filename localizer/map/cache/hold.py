@@ -17,7 +17,7 @@ from localizer.errors import MapCacheError
 
 class CacheLock:
     """Lock that prevents a replacement of the cache at `path` until `close`. Any number of readers
-    may have it at once.
+    may have it at once. `MapCacheError` if it is just being replaced, or cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -37,7 +37,9 @@ class CacheLock:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[None]:
-    """Context manager: lock the cache at `path` for a replacement; `MapCacheError` if in use."""
+    """Context manager: lock the cache at `path` for a replacement; `MapCacheError` if in use.
+    Nothing is locked if `path` does not exist.
+    """
     if not path.exists():
         yield
         return

@@ -33,7 +33,8 @@ class ResidentNodes:
 
     def add(self, node: int, meshes: list[TileMesh], *, keep: Collection[int], beside: int) -> None:
         """Add a node and evict others if necessary, but not those in `keep`, so that a view can
-        complete. beside: further bytes in memory that count against the budget.
+        complete; the budget may then be exceeded. beside: further bytes in memory that count
+        against the budget.
         """
         size = int(self.sizes[node])
         self._make_room(beside + size, keep)

@@ -101,9 +101,7 @@ class TileSelector:
         sizes: NDArray[np.int64],
         budget: int,
     ) -> DetailLimits:
-        """The finest limits at which the view's wanted nodes, of `sizes` bytes (N,), fit into the
-        budget.
-        """
+        """The finest limits at which a view's wanted nodes, `sizes` bytes (N,), fit the budget."""
         limits = finest
         everything = np.ones(len(sizes), np.bool_)
         for _ in range(16):

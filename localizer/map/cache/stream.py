@@ -94,7 +94,7 @@ class TileStreamer:
     def select(
         self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
     ) -> list[TileMesh]:
-        """Meshes to draw for a view.
+        """Meshes to draw for a view; missing tiles are loaded in the background.
 
         wait: block until all needed detail is resident. A tile that cannot be read then raises
         `MapCacheError`. Without `wait` its parent is shown, and the failure is logged.
@@ -123,8 +123,8 @@ class TileStreamer:
             return list(self._current)
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """Load the tiles of future views (world_from_camera) in order, after those of the current
-        view, as far as the budget allows.
+        """Have the tiles of future views (world_from_camera) loaded in order, after the current
+        view's, as far as the budget allows; returns at once.
         """
         limits = [self._fitting_limits(view, camera) for view in views]
         with self._lock:
@@ -164,7 +164,7 @@ class TileStreamer:
             return self._waiting and not (self._nodes.evicted or self._to_load())
 
     def close(self) -> None:
-        """Stop the loader thread, unless its disk does not respond, and drop all tiles."""
+        """Stop the loader thread (waits at most 10 s), drop all tiles, and unlock the cache."""
         with self._lock:
             self._closed = True
             self._lock.notify_all()

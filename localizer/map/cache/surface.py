@@ -54,7 +54,7 @@ class MapSurface:
 
     @property
     def resident_bytes(self) -> int:
-        """Of the geometry in memory."""
+        """Bytes of the geometry in memory."""
         with self._lock:
             return sum(mesh.nbytes for mesh in self._meshes.values())
 

@@ -85,8 +85,9 @@ class Area:
 
 
 def area_around(points: Array, margin_m: float) -> Area:
-    """The rectangle within `margin_m` of positions (n, 2), latitude and longitude in degrees.
-    `MapFetchError` without a position, or if the margin is not above 0 and at most 100 km.
+    """The rectangle that reaches `margin_m` beyond positions (n, 2), latitude and longitude in
+    degrees, to all sides. `MapFetchError` without a position, or if the margin is not above 0 and
+    at most 100 km.
     """
     at = np.asarray(points, np.float64).reshape(-1, 2)
     if not len(at) or not np.isfinite(at).all():

@@ -140,8 +140,9 @@ def _entries(path: Path) -> list[Any]:
 def choose(
     sources: tuple[CatalogueSource, ...], area: Area, role: str, name: str | None = None
 ) -> CatalogueSource:
-    """The source `name`; None: the finest that covers the area. role: imagery or heights; surface
-    models precede terrain models, and worldwide ones come last. `MapFetchError` if there is none.
+    """The source `name`, which need not cover the whole area; None: the best that covers it: one of
+    10 m or finer before coarser ones, surface before terrain models, then the finest, then that of
+    the smallest bounds. role: imagery or heights. `MapFetchError` if there is none.
     """
     fitting = [s for s in sources if s.has_heights == (role == "heights")]
     if name is not None:

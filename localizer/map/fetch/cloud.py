@@ -241,7 +241,7 @@ def _opened(url: str, client: HttpClient, failed: list[MapFetchError]) -> Any:
         raise MapFetchError(f"{safe_url(url)}: no GeoTIFF that can be read: {error}") from error
 
 
-def check_depth(name: str, dtype: str) -> None:
+def require_8_bits(name: str, dtype: str) -> None:
     """`MapFetchError` for images of more than 8 bits, whose value range is unknown."""
     if dtype != "uint8":
         raise MapFetchError(
@@ -285,7 +285,7 @@ def _of_file(
             _warped(data, window, how, source) as vrt,
         ):
             if not source.has_heights:
-                check_depth(safe_url(url), data.dtypes[0])
+                require_8_bits(safe_url(url), data.dtypes[0])
             read = vrt.read(list(range(1, min(bands, data.count) + 1)))
             if source.has_heights:
                 read = metres_of(source, _name(url), data, window.crs).metres(read)

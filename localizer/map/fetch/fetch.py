@@ -63,9 +63,10 @@ def fetch(
     source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path, client: HttpClient,
     progress: Progress = lambda _done, _total: None,
 ) -> float:  # fmt: skip
-    """Download the raster to `out`. Pieces of an interrupted run in `folder` are reused; those of
-    another plan are removed. Returns the share of valid pixels. `MapFetchError` if the source has
-    too little of the area.
+    """Download the raster to `out`. folder: keeps the pieces, for this download alone: those of an
+    interrupted run of this plan are reused, and all its files are deleted if they are of another
+    plan. Returns the share of valid pixels. `MapFetchError` if the source has less than half of the
+    area.
     """
     _claim(source, plan, folder)
     missing = [p for p in plan.pieces if not (folder / p.name).exists()]

@@ -35,9 +35,7 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True)
 class RequestLimits:
-    """Limits of a client. rate_per_s: requests a second to one host; most_bytes: sum of all
-    answers.
-    """
+    """Limits. rate_per_s: requests a second to one host; most_bytes: sum of all answers."""
 
     rate_per_s: float = 4.0
     most_bytes: int = 4 << 30

@@ -18,7 +18,7 @@ from rasterio.windows import Window
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.cloud import NODATA, check_depth
+from localizer.map.fetch.cloud import NODATA, require_8_bits
 from localizer.map.fetch.heights import UNITS, metres_of
 from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.importers.raster_file import offline
@@ -68,9 +68,7 @@ def assemble(source: CatalogueSource, plan: FetchPlan, folder: Path, out: Path) 
 
 
 def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
-    """`MapFetchError` if a piece is no complete image, has more than 8 bits, or another size than
-    requested.
-    """
+    """`MapFetchError` for no complete image, more than 8 bits, or another size than asked for."""
     try:
         if data[:4] in _TIFF:
             with offline(), MemoryFile(data) as memory, memory.open(driver="GTiff") as image:
@@ -88,7 +86,7 @@ def check_piece(source: CatalogueSource, piece: Piece, data: bytes) -> None:
     ) as error:  # fmt: skip
         raise MapFetchError(f"{source.name}: piece {piece.name} is no image: {error}") from error
     if not source.has_heights:
-        check_depth(f"{source.name}: piece {piece.name}", dtype)
+        require_8_bits(f"{source.name}: piece {piece.name}", dtype)
     elif bands != 1 or dtype == "uint8":
         raise MapFetchError(
             f"{source.name}: sends {bands} bands of {dtype}, no heights; set `format` to a GeoTIFF "

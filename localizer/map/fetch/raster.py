@@ -119,7 +119,7 @@ def north_first(crs: CRS) -> bool:
 
 
 def metres_per_unit(crs: CRS, latitude_deg: float) -> tuple[float, float]:
-    """Ground metres per unit of the first and second axis, at a latitude."""
+    """Ground metres per unit of a CRS to the east and to the north, at a latitude."""
     if crs.is_geographic:
         return 111_320.0 * math.cos(math.radians(latitude_deg)), 110_574.0
     factor = float(crs.axis_info[0].unit_conversion_factor)

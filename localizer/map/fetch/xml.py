@@ -10,8 +10,8 @@ _MOST_BYTES = 32 << 20
 
 
 def parse_xml(data: bytes) -> ElementTree.Element:
-    """Parse XML; returns the root. Document types are rejected, because entities can expand without
-    limit. ParseError for invalid XML.
+    """Parse XML; returns the root. `MapFetchError` for over 32 MiB and for entities of its own,
+    which can expand without limit; ParseError for invalid XML.
     """
     if len(data) > _MOST_BYTES or b"<!ENTITY" in data:
         raise MapFetchError("a server's XML is too long, or brings entities of its own")

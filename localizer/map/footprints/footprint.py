@@ -56,7 +56,9 @@ class Footprints:
 
 
 def ring_of(places: object) -> Array | None:
-    """(N, 2) of a closed ring; None if it is invalid or has no area."""
+    """(N, 2) of a ring from its positions (x, y, and more), closed if it was open; None if it is
+    invalid or has no area.
+    """
     try:
         ring = np.array([[float(p[0]), float(p[1])] for p in places])  # type: ignore[attr-defined]
     except (TypeError, ValueError, IndexError, KeyError, OverflowError):
@@ -71,7 +73,7 @@ def ring_of(places: object) -> Array | None:
 
 
 def one_line(text: object) -> str:
-    """A file's text for the map's manifest: printable, one line, limited length."""
+    """A file's text, printable, in one line of 300 characters at most; "" if it is no text."""
     if not isinstance(text, str):
         return ""
     plain = "".join(c if c.isprintable() else " " for c in text)
@@ -79,7 +81,7 @@ def one_line(text: object) -> str:
 
 
 def sane_height(value: object) -> float | None:
-    """Metres of a number or of text such as "12.5 m"; None if implausible."""
+    """Metres of a number or of text such as "12.5 m"; None unless above 0 and up to 1000."""
     if isinstance(value, str):
         value = value.strip().removesuffix("m").strip()
     if isinstance(value, bool) or not isinstance(value, str | int | float):

@@ -72,8 +72,8 @@ def read_footprints(path: Path, height_property: str | None = None) -> Footprint
 
 
 def raise_buildings(terrain: Path, footprints: Footprints, out: Path) -> RaiseResult:
-    """Write the surface `out`, a GeoTIFF in the terrain's CRS. `MapSourceError` if no building is
-    on the terrain, or its heights are not in metres.
+    """Write the surface `out`, a GeoTIFF in the terrain's CRS, replacing a file there.
+    `MapSourceError` if no building is on the terrain, or its heights are not in metres.
     """
     try:
         with offline(), open_raster(terrain) as data:

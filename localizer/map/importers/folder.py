@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from localizer.errors import MapSourceError
-from localizer.plain_files import files_of, visible
+from localizer.plain_files import files_of, without_hidden
 
 MESHES = (".glb", ".gltf", ".obj")
 RASTERS = (".tif", ".tiff", ".vrt")
@@ -71,7 +71,7 @@ def source_in(folder: Path, georeference_given: bool) -> FoundSource:
 
 
 def _ways(folder: Path, georeference_given: bool) -> Iterator[FoundSource]:
-    for path in visible(folder.glob("*tileset*.json")):  # under another name
+    for path in without_hidden(folder.glob("*tileset*.json")):  # under another name
         yield FoundSource((path,))
     for name in _ODM_TILESETS:
         if (folder / name / TILESET).is_file():
@@ -94,7 +94,7 @@ def _ways(folder: Path, georeference_given: bool) -> Iterator[FoundSource]:
 
 def _found(folder: Path) -> str:
     """Names of the files in a folder, two levels deep, that an importer may read."""
-    deep = [folder, *visible(p for p in folder.iterdir() if p.is_dir())]
+    deep = [folder, *without_hidden(p for p in folder.iterdir() if p.is_dir())]
     files = [p for place in deep for p in files_of(place, (*MESHES, *RASTERS))]
     files += [p.parent / p.name for p in sorted(folder.glob(f"*/{TILESET}"))]
     if not files:

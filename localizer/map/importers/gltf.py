@@ -366,7 +366,9 @@ def _triangles(indices: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
     if mode == 6:
         first = np.full(len(indices) - 2, indices[0])
         return np.stack([first, indices[1:-1], indices[2:]], axis=-1)
-    return np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=-1)
+    strip = np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=-1)
+    strip[1::2] = strip[1::2, ::-1]  # every second triangle winds the other way
+    return strip
 
 
 def _transformed_uvs(uvs: Array, transform: dict[str, Any]) -> Array:

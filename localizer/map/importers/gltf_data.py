@@ -35,7 +35,7 @@ class GltfData:
         self._buffers: dict[int, bytes] = {}
 
     def picture(self, index: int) -> bytes:
-        """Bytes of an encoded image: JPEG, PNG or WebP."""
+        """Bytes of an encoded image: JPEG, PNG or WebP. `MapSourceError` if there is none."""
         image = item(self.json.get("images", []), index, "image")
         if "bufferView" in image:
             return self.buffer_view(image["bufferView"])[0]
@@ -153,9 +153,7 @@ def normalised_bounds(bounds: Array, accessor: dict[str, Any]) -> Array:
 
 
 def vector(values: Any, length: int, what: str) -> Array:
-    """Numbers of the JSON as (length,). what: name for the error. `MapSourceError` for other
-    values.
-    """
+    """Numbers of the JSON as (length,); `MapSourceError`, which names `what`, for others."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:

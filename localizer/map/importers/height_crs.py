@@ -59,8 +59,8 @@ class StatedHeights:
 
 def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeights:
     """Unit and datum by a source's CRS and its band's unit tag (None: no tag); `GeoreferenceError`
-    if they contradict. where: the source; a GeoTIFF's keys are used if the CRS has no vertical
-    part.
+    if they contradict. where: the source; if it is the path of a GeoTIFF, its own vertical keys
+    precede the CRS.
     """
     keys = geo_keys(where) if isinstance(where, Path) else {}
     unit, datum, name = _keyed_heights(keys, where)
@@ -120,7 +120,9 @@ def _keyed_heights(
 
 
 def geo_keys(path: Path) -> dict[int, int]:
-    """Numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty without one."""
+    """Numbers of a GeoTIFF's key directory (tag 34735, OGC 19-008r4); empty without one, and for a
+    file that cannot be read.
+    """
     try:
         with path.open("rb") as file:
             return _geo_keys(file)

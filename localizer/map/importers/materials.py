@@ -158,8 +158,8 @@ class MtlMaterial:
 
 
 def read_mtl(library: Path, obj_folder: Path) -> list[MtlMaterial]:
-    """The materials of a library in order. The ambient or emissive texture replaces a missing
-    diffuse one.
+    """The materials of a library in order. Textures are looked for beside it, then in the OBJ's
+    folder. The ambient or emissive texture replaces a missing diffuse one.
     """
     made: list[MtlMaterial] = []
     rank = 0

@@ -34,7 +34,9 @@ _LEAST_OVERLAP, _GOOD_OVERLAP = 0.05, 0.5
 def check_heights(
     path: Path, data: DatasetReader, band: HeightBand, rules: ImportRules
 ) -> list[str]:
-    """Warnings about a DSM's values; `MapSourceError` if they cannot be heights."""
+    """Warnings about a DSM's values; `MapSourceError` if they cannot be heights, unless the user
+    accepts this.
+    """
     raw = _sampled(data, band)
     known = raw.compressed()
     if not len(known):
@@ -198,7 +200,9 @@ def check_colours(path: Path, data: DatasetReader, bands: tuple[int, int, int]) 
 def check_overlap(
     dsm: DatasetReader, band: HeightBand, ortho: DatasetReader, rules: ImportRules
 ) -> list[str]:
-    """Warnings if the orthophoto covers little of the DSM; an error if nothing."""
+    """Warnings if the orthophoto covers less than half of the DSM; `MapSourceError` if nothing of
+    it, or (unless the user accepts this) less than 5 %.
+    """
     share = _covered_share(dsm, band, ortho)
     if share >= _GOOD_OVERLAP:
         return []

@@ -57,7 +57,7 @@ def offline() -> Iterator[None]:
 
 
 def open_raster(path: Path) -> DatasetReader:
-    """Open a GeoTIFF; `MapSourceError` for another file. Use under `offline`."""
+    """Open a GeoTIFF under `offline`; the caller closes it. `MapSourceError` for another file."""
     require_plain_file(path)
     _require_tiff(path)
     for beside in (f"{path}.ovr", f"{path}.msk"):
@@ -72,8 +72,8 @@ def open_raster(path: Path) -> DatasetReader:
 
 
 def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRules) -> Path:
-    """Write a constant height model below an orthophoto, for a flat map. `MapSourceError` or
-    `GeoreferenceError` if the orthophoto has heights or no georeference.
+    """Write a constant height model below an orthophoto, for a flat map, to `path`, and return
+    that. `MapSourceError` or `GeoreferenceError` if the orthophoto has heights or no georeference.
     """
     with offline(), open_raster(ortho) as data:
         require_sane(ortho, data, rules)
@@ -92,7 +92,7 @@ def write_flat_ground(ortho: Path, height_m: float, path: Path, rules: ImportRul
 
 
 def open_cached(path: Path) -> DatasetReader:
-    """As `open_raster`; the dataset is cached for the next tile of the same process."""
+    """As `open_raster`, but kept for the next tile of the same process: do not close it."""
     stat = path.stat()
     return _kept(path, stat.st_mtime_ns, stat.st_size)
 
@@ -182,7 +182,7 @@ def has_own_mask(data: DatasetReader) -> bool:
 
 
 def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
-    """Band numbers of red, green and blue; `MapSourceError` for a palette."""
+    """Band numbers of red, green and blue, equal for grey; `MapSourceError` for a palette."""
     meaning = list(data.colorinterp)
     if meaning[0] == ColorInterp.palette:
         raise MapSourceError(
@@ -246,9 +246,7 @@ def _flat(source: str, target: str) -> Transformer:
 
 @dataclass(frozen=True)
 class HeightBand:
-    """Conversion of a DSM's values to metres: value * gain + offset; missing: an additional nodata
-    value.
-    """
+    """Makes metres of a DSM's values: value * gain + offset. missing: one more nodata value."""
 
     gain: float = 1.0
     offset: float = 0.0

@@ -69,7 +69,9 @@ def _exists(path: Path) -> bool:
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
-    """Files that an OBJ, glTF, GLB or b3dm refers to, sorted by name."""
+    """Files that an OBJ, glTF, GLB or b3dm refers to, whether they exist or not, sorted by name;
+    empty if the file cannot be read.
+    """
     if not path.is_file():  # a pipe would never end
         return ()
     try:

@@ -29,9 +29,7 @@ LOWEST_M, HIGHEST_M = -500.0, 9000.0  # of ground, buildings and mines' edges, i
 
 @dataclass(frozen=True)
 class ImportRules:
-    """Limits of one import; trusted: names of `DOUBTS` that the user accepts, which become
-    warnings.
-    """
+    """Limits of one import; trusted: names of `DOUBTS` that become warnings."""
 
     nodes: int = field(default=1_000_000, metadata={"counts": "nodes of a tileset, glTF or raster"})
     depth: int = field(default=200, metadata={"counts": "levels of nodes"})
@@ -57,9 +55,7 @@ class ImportRules:
 
     @classmethod
     def of(cls, limits: Iterable[str] = (), trusted: Iterable[str] = ()) -> ImportRules:
-        """From the command line's ``NAME=NUMBER`` and names of doubts. `MapSourceError` for invalid
-        ones.
-        """
+        """From ``NAME=NUMBER`` and names of doubts; `MapSourceError` for invalid ones."""
         given: dict[str, Any] = {}
         for text in limits:
             name, _, number = text.partition("=")
@@ -78,7 +74,7 @@ class ImportRules:
         return {name: getattr(self, name) for name in limit_names()}
 
     def require(self, name: str, amount: float, where: object) -> None:
-        """`MapSourceError` if a source exceeds a limit."""
+        """`MapSourceError`, which names `where`, if `amount` exceeds the limit `name`."""
         limit = getattr(self, name)
         if amount > limit:
             counts = next(f.metadata["counts"] for f in fields(self) if f.name == name)
@@ -102,7 +98,7 @@ def limit_names() -> tuple[str, ...]:
 
 
 def require_plain_file(path: Path) -> None:
-    """`MapSourceError` for a pipe, socket or device, which may block for ever."""
+    """`MapSourceError` for a missing file, or a pipe, socket or device, which may block."""
     try:
         mode = path.stat().st_mode
     except OSError as error:

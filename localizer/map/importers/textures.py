@@ -32,7 +32,7 @@ def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
 
 
 def require_readable(path: Path, rules: ImportRules) -> None:
-    """`MapSourceError` if an image cannot be decoded; trimesh would show the mesh grey."""
+    """`MapSourceError` for an image too large or not decodable: trimesh would show it grey."""
     try:
         with PillowImage.open(path) as picture:
             width, height = picture.size
@@ -58,7 +58,7 @@ def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
 
 
 def decode_alpha(data: bytes) -> NDArray[np.uint8] | None:
-    """Alpha (h, w) of an image; None if it is opaque."""
+    """Alpha (h, w) of an image that `decode_image` could read; None if it is opaque."""
     with PillowImage.open(io.BytesIO(data)) as picture:
         if not picture.has_transparency_data:
             return None
@@ -67,7 +67,9 @@ def decode_alpha(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> SourceMesh:
-    """A mesh of flat-coloured faces. colours: (F, 3) uint8, stored as blocks of a texture."""
+    """A mesh of flat-coloured faces. colours: (F, 3) uint8, stored as blocks of a texture; of more
+    than 65,536 different ones the lower 3 bits are dropped.
+    """
     unique, which = np.unique(colours.reshape(-1, 3), axis=0, return_inverse=True)
     if len(unique) > 65536:
         unique, which = np.unique(colours & 0xF8, axis=0, return_inverse=True)

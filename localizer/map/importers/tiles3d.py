@@ -39,7 +39,9 @@ _Z_UP = {
 
 @dataclass(frozen=True, eq=False)
 class ContentFile:
-    """A tile's content. folder: the tileset's; ecef_from_tile: (4, 4); up_axis: of its glTF."""
+    """A tile's content. folder: the tileset's; ecef_from_tile: (4, 4); up_axis: of its glTF. What
+    reads the file raises `MapSourceError` if that fails.
+    """
 
     path: Path
     folder: Path
@@ -140,7 +142,7 @@ def _read_tileset(path: Path, rules: ImportRules, up_axis: UpAxis | None) -> Sou
 
 
 def read_file(path: Path, rules: ImportRules) -> bytes:
-    """Bytes of a source file. `MapSourceError` if it is missing, an archive or too large."""
+    """Bytes of a file, gzip unpacked. `MapSourceError`: missing, another archive, or too large."""
     require_plain_file(path)
     try:
         rules.require("file_bytes", path.stat().st_size, path)

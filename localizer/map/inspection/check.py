@@ -73,7 +73,9 @@ class MapUse:
         return self.height_m * self.pixel_rad
 
     def width_px(self, pixel_m: float) -> int:
-        """Working width (multiple of 16) at which a pixel covers at least pixel_m of ground."""
+        """Largest working width (a multiple of 16, at least 64) at which a pixel covers pixel_m of
+        ground or more.
+        """
         ground_m = 2.0 * self.height_m * math.tan(math.radians(self.half_view_deg))
         return max(int(ground_m / pixel_m) // 16, _LEAST_WIDTH // 16) * 16
 
@@ -98,8 +100,8 @@ class MapCheck:
 
 @dataclass(frozen=True)
 class Seam:
-    """A visible border between tiles. ends: rows and columns of its ends; height_m, grey: median
-    steps across it, minus those beside it.
+    """A border between tiles. ends: rows and columns of its ends; height_m, grey: median steps
+    across it, minus those beside it.
     """
 
     ends: tuple[tuple[int, int], tuple[int, int]]
@@ -113,7 +115,9 @@ class Seam:
 
 
 def check_map(cache: TileCache, use: MapUse) -> MapCheck:
-    """Run all checks, with an image of each."""
+    """Run all checks, which reads every tile; images show coverage, texels, seams and alignment.
+    `MapCacheError` if a tile that an image needs is damaged.
+    """
     mosaic = render_mosaic(cache)
     gaps, holes = _holes(mosaic)
     blank = _blank(mosaic) | _without_texels(cache, mosaic, use)
@@ -147,7 +151,7 @@ def check_map(cache: TileCache, use: MapUse) -> MapCheck:
 
 
 def find_seams(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
-    """Borders of the finest nodes inside the map."""
+    """Borders of the finest nodes inside the map, visible or not (`Seam.seen`)."""
     index, rows, columns = cache.index, *mosaic.height.shape
     grey = mosaic.rgb.astype(np.float32).mean(axis=2)
     found = []

@@ -160,13 +160,6 @@ def depth_picture(depth: NDArray[np.float32]) -> Image:
     return np.where(shown[..., None], cv2.cvtColor(colours, cv2.COLOR_BGR2RGB), 0).astype(np.uint8)
 
 
-def write_picture(path: Path, rgb: Image) -> None:
-    """Write an RGB image in the format of the suffix; OSError if that fails."""
-    # imencode, because imwrite prints a warning and keeps the reason for itself.
-    coded = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
-    path.write_bytes(coded.tobytes())
-
-
 def export_glb(cache: TileCache, out: Path, level: int | None = None) -> int:
     """Write the surface as one GLB, y up, metres from the cache's origin; returns the number of
     triangles.

@@ -40,7 +40,9 @@ class Mosaic:
 
 
 def render_mosaic(cache: TileCache, most_px: int = _MOST_PX) -> Mosaic:
-    """Render the map's bounding rectangle at its resolution, at most `most_px`."""
+    """Render the map's bounding rectangle at its resolution, at most `most_px`. `MapCacheError` for
+    a tile that cannot be read.
+    """
     low, high = cache.index.box_min[0], cache.index.box_max[0]
     extent = (high - low)[:2]
     finest = max(cache.manifest.gsd_m, _FINEST_M)

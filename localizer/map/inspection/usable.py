@@ -74,9 +74,7 @@ def usable_part(
 
 
 def largest_rectangle(good: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    """First and last (exclusive) row, then column, of the largest all-true rectangle; None: no cell
-    is true.
-    """
+    """(first row, end row, first column, end column) of the largest all-true rectangle, or None."""
     best, found = 0, None
     above = np.zeros(good.shape[1], np.int64)
     for row, line in enumerate(good):

@@ -1,6 +1,7 @@
 """The small dense algebra of the numba kernel: the 6x6 system, the retraction, the quadratic prior.
 
-float64 throughout, in place on scratch that the caller owns. Equation numbers are of
+float64 throughout, in place on scratch that the caller owns. sums: H's lower triangle by rows (21),
+then g (6). R, t: a pose camera_from_local. Equation numbers are of
 docs/explanation/registration.md.
 """
 

@@ -291,7 +291,7 @@ def refine_kernel(channels: int) -> Callable[..., int]:
 
 
 class NumbaBackend:
-    """Splits the hypotheses over `threads` worker threads; reuses its scratch between frames."""
+    """Splits the hypotheses over threads. One `refine` at a time: it reuses its scratch."""
 
     def __init__(self, threads: int = 2) -> None:
         self.name = f"numba ({threads} thread{'s' if threads > 1 else ''}, float32)"

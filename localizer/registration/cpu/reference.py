@@ -64,7 +64,7 @@ def count_in_view(problem: LevelProblem, rotation: Array, translation: Array) ->
 
 
 def feature_gradients(features: Float32, u: Array, v: Array) -> tuple[Array, Array]:
-    """Derivatives (N, C) of the bilinear interpolation along x and y, exact within a cell."""
+    """Derivatives (N, C), along x and y, of the bilinear interpolation at indices u, v (N,)."""
     h, w = features.shape[:2]
     x0 = np.clip(np.floor(u).astype(np.int64), 0, w - 2)
     y0 = np.clip(np.floor(v).astype(np.int64), 0, h - 2)

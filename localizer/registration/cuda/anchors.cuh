@@ -54,21 +54,7 @@ __device__ inline int step_for(int total, int wanted) {
     return step < 2 ? 1 : step;
 }
 
-#if HALF_FEATURES
-__device__ inline void load(const Feature* from, float (&to)[VECTOR]) {
-    if constexpr (VECTOR == 8) {
-        const uint4 bits = __ldg(reinterpret_cast<const uint4*>(from));
-        half_pair(bits.x, to[0], to[1]);
-        half_pair(bits.y, to[2], to[3]);
-        half_pair(bits.z, to[4], to[5]);
-        half_pair(bits.w, to[6], to[7]);
-    } else {
-        float none;
-        half_pair(__ldg(from), to[0], none);
-    }
-}
-#else
-__device__ inline void load(const Feature* from, float (&to)[VECTOR]) {
+__device__ inline void load(const float* from, float (&to)[VECTOR]) {
     if constexpr (VECTOR == 4) {
         const float4 f = __ldg(reinterpret_cast<const float4*>(from));
         to[0] = f.x;
@@ -79,7 +65,6 @@ __device__ inline void load(const Feature* from, float (&to)[VECTOR]) {
         to[0] = __ldg(from);
     }
 }
-#endif
 
 // Equation 1 and the test for the view.
 __device__ inline void project(const Level& level, const PoseF& pose, int anchor, Terms& terms) {
@@ -157,7 +142,7 @@ __device__ inline Terms anchor_terms(const Level& level, const PoseF& pose, bool
                 f11[IN_FLIGHT][VECTOR], fr[IN_FLIGHT][VECTOR];
 #pragma unroll
             for (int i = 0; i < IN_FLIGHT; ++i) {
-                const Feature* corner =
+                const float* corner =
                     level.features + (size_t)__float_as_int(own[i].x) * CHANNELS + channel;
                 load(corner, f00[i]);
                 load(corner + CHANNELS, f01[i]);

@@ -16,30 +16,29 @@ from localizer.registration.cuda.driver import Arena, Device, Kernels
 
 FEW = 16  # hypotheses at most for which larger blocks pay: they leave multiprocessors idle anyway
 
-Compile = Callable[[int, bool, tuple[int, int]], Image]
+Compile = Callable[[int, tuple[int, int]], Image]
 
 
 class CudaBackend:
     """Refines hypotheses on the GPU. Buffers are kept between calls; calls run one at a time.
 
-    half: features are stored as float16 on the device (arithmetic stays float32). compile: makes
-    the kernels for (channels, half, architecture).
+    compile: makes the kernels for (channels, architecture).
     """
 
-    def __init__(
-        self, device: Device, *, half: bool = False, compile: Compile = compile_kernels
-    ) -> None:
-        self.device, self.half = device, half
-        self.name = f"cuda ({device.name}, {'float16' if half else 'float32'} features)"
+    def __init__(self, device: Device, *, compile: Compile = compile_kernels) -> None:
+        self.device = device
+        self.name = f"cuda ({device.name})"
         self._compile = compile
         self._kernels: dict[int, Kernels] = {}
         self.lock = threading.Lock()
         self.arena = Arena(device)
 
     def kernels(self, channels: int) -> Kernels:
-        """The loaded kernels for a channel count; compiling takes seconds, once per machine."""
+        """The loaded kernels for a channel count; the first call compiles for seconds, once per
+        machine. The device must be active. `CudaError` if that fails.
+        """
         if channels not in self._kernels:
-            image = self._compile(channels, self.half, self.device.architecture)
+            image = self._compile(channels, self.device.architecture)
             self._kernels[channels] = self.device.load(image.code)
         return self._kernels[channels]
 
@@ -79,7 +78,7 @@ class CudaBackend:
         )
 
     def close(self) -> None:
-        """Free the device memory."""
+        """Free the buffers in device memory; a later call allocates them again."""
         with self.lock:
             self.device.activate()
             self.arena.close()
@@ -97,13 +96,11 @@ class CudaBackend:
         """
         put, M = self.arena.put, len(rotations)
         level = np.zeros((), dtype=layout.LEVEL)
-        level["features"] = put("features", to_precision(problem.features, self.half))
-        level["confidence"] = put("confidence", _floats(problem.confidence))
-        level["points"] = put("points", _floats(problem.points))
-        level["anchor_features"] = put(
-            "anchor_features", to_precision(problem.anchor_features, self.half)
-        )
-        level["anchor_confidence"] = put("anchor_confidence", _floats(problem.anchor_confidence))
+        level["features"] = put("features", as_floats(problem.features))
+        level["confidence"] = put("confidence", as_floats(problem.confidence))
+        level["points"] = put("points", as_floats(problem.points))
+        level["anchor_features"] = put("anchor_features", as_floats(problem.anchor_features))
+        level["anchor_confidence"] = put("anchor_confidence", as_floats(problem.anchor_confidence))
         level["height"], level["width"] = problem.confidence.shape
         level["total"] = problem.points.shape[1]
         level["focal"], level["centre"] = problem.focal, problem.centre
@@ -147,10 +144,6 @@ def packed_prior(problem: LevelProblem) -> NDArray[np.void]:
     return packed
 
 
-def to_precision(features: NDArray[np.floating], half: bool) -> NDArray[np.floating]:
-    """Features as a contiguous array in the device's precision (half: float16)."""
-    return np.ascontiguousarray(features, dtype=np.float16 if half else np.float32)
-
-
-def _floats(array: NDArray[np.floating]) -> NDArray[np.float32]:
+def as_floats(array: NDArray[np.floating]) -> NDArray[np.float32]:
+    """A contiguous array in the device's precision."""
     return np.ascontiguousarray(array, dtype=np.float32)

@@ -34,21 +34,21 @@ class Image:
 
 
 def cache_directory() -> Path:
-    """Folder of compiled images: `PILOT_CACHE`, else the user's cache directory."""
+    """Folder of compiled images, which may not exist: "cuda" in PILOT_CACHE or the user's cache."""
     return cache_folder("cuda")
 
 
 def compile_kernels(
-    channels: int, half: bool, architecture: tuple[int, int], cache: Path | None = None
+    channels: int, architecture: tuple[int, int], cache: Path | None = None
 ) -> Image:
-    """Compile the kernels for one channel count and compute capability (half: float16 features), or
-    load them from the cache folder (None: `cache_directory`).
+    """Compile the kernels for one channel count and compute capability, or load them from the cache
+    folder (None: `cache_directory`).
 
     If the cache cannot be written, the kernels are compiled at every start. Raises
     `CudaUnavailableError` without NVRTC, `CudaError` if it refuses the source.
     """
     sources = {path.name: path.read_text() for path in sorted(SOURCES.glob("*.cu*"))}
-    return compile_sources(sources, _MAIN, macros(channels, half), architecture, cache)
+    return compile_sources(sources, _MAIN, macros(channels), architecture, cache)
 
 
 def compile_sources(

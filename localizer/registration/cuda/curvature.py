@@ -17,7 +17,7 @@ from localizer.registration.cuda.steps import KernelLaunch
 from localizer.types import Float32
 
 
-def geometry(
+def level_without_features(
     points: Float32,
     focal: tuple[float, float],
     centre: tuple[float, float],
@@ -36,7 +36,7 @@ def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) ->
     return mean_motion(projection_jacobian(problem, x[visible], translation))
 
 
-def winner_curvature(
+def winner_curvature(  # noqa: PLR0913
     backend: CudaBackend,
     memory: FrameMemory,
     scoring: KernelLaunch,

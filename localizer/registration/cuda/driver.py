@@ -36,7 +36,6 @@ class Device:
             self._attribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR),
         )
         self.multiprocessors = self._attribute(attribute.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
-        self.clock_hz = 1e3 * self._attribute(attribute.CU_DEVICE_ATTRIBUTE_CLOCK_RATE)
         self.stream = self._call(
             self._api.cuStreamCreate, self._api.CUstream_flags.CU_STREAM_NON_BLOCKING
         )
@@ -50,7 +49,7 @@ class Device:
         return Kernels(self, self._call(self._api.cuModuleLoadData, code))
 
     def allocate(self, size: int) -> int:
-        """Address of `size` bytes of device memory (at least 1)."""
+        """Address of `size` bytes of device memory (at least 1), until the caller calls `free`."""
         return int(self._call(self._api.cuMemAlloc, max(size, 1)))
 
     def free(self, address: int) -> None:
@@ -63,8 +62,8 @@ class Device:
         return np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(address))
 
     def upload(self, address: int, array: NDArray[Any]) -> None:
-        """Queue a copy of a C-contiguous array to the device; pageable memory is staged at once.
-        ValueError for another layout.
+        """Queue a copy of a C-contiguous array to the device; ValueError for another layout. The
+        array may be changed at once, `pinned` memory only after `synchronize`.
         """
         if not array.flags.c_contiguous:
             raise ValueError("only C-contiguous arrays can be copied to the device")
@@ -87,7 +86,9 @@ class Device:
         self._call(self._api.cuStreamSynchronize, self.stream)
 
     def capture(self, enqueue: Callable[[], None]) -> Graph:
-        """Capture the work that `enqueue` queues as a graph, without running it."""
+        """Capture the work that `enqueue` queues as a graph, without running it. Its kernels must
+        be loaded before (`Kernels.load_all`).
+        """
         mode = self._api.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_THREAD_LOCAL
         self._call(self._api.cuStreamBeginCapture, self.stream, mode)
         try:
@@ -191,7 +192,9 @@ class Arena:
         self.generation = 0  # changes when any address has changed
 
     def buffer(self, name: str, size: int) -> int:
-        """Device address of buffer `name`, at least `size` bytes; enlarging loses its content."""
+        """Device address of buffer `name`, at least `size` bytes; enlarging it loses its content
+        and changes the address.
+        """
         address, have = self._buffers.get(name, (0, 0))
         if address and have >= size:
             return address

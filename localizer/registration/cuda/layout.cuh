@@ -2,15 +2,9 @@
 // sizes as options, so that a disagreement does not compile.
 #pragma once
 
-// Given by the compiler's options: CHANNELS, HALF_FEATURES, IN_FLIGHT, BYTES_OF_*.
+// Given by the compiler's options: CHANNELS, IN_FLIGHT, BYTES_OF_*.
 
-#if HALF_FEATURES
-typedef unsigned short Feature;  // bits of an IEEE half
-constexpr int VECTOR = CHANNELS % 8 == 0 ? 8 : 1;
-#else
-typedef float Feature;
 constexpr int VECTOR = CHANNELS % 4 == 0 ? 4 : 1;
-#endif
 
 constexpr int WARP = 32;
 constexpr unsigned ALL = 0xffffffffu;
@@ -19,10 +13,10 @@ constexpr float MIN_DEPTH = 0.1f;  // m
 // One pyramid level of the query and the anchors as seen on it. Anchor i of the `total` has point
 // (points[i], points[total + i], points[2 total + i]) in the local frame.
 struct Level {
-    const Feature* features;  // (height, width, CHANNELS)
+    const float* features;  // (height, width, CHANNELS)
     const float* confidence;  // (height, width)
     const float* points;
-    const Feature* anchor_features;  // (total, CHANNELS)
+    const float* anchor_features;  // (total, CHANNELS)
     const float* anchor_confidence;
     int height, width, total, unused;
     float fx, fy, cx, cy;  // array index units

@@ -128,10 +128,10 @@ _NAMES = {
 }
 
 
-def macros(channels: int, half: bool, in_flight: int = 2) -> dict[str, int]:
+def macros(channels: int, in_flight: int = 2) -> dict[str, int]:
     """Macros for the source, with the structures' sizes, which it checks.
 
     in_flight: anchors per group of lanes whose features are loaded before the first is used.
     """
-    values = {"CHANNELS": channels, "HALF_FEATURES": int(half), "IN_FLIGHT": in_flight}
+    values = {"CHANNELS": channels, "IN_FLIGHT": in_flight}
     return values | {f"BYTES_OF_{name}": dtype.itemsize for name, dtype in _NAMES.items()}

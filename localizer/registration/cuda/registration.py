@@ -23,7 +23,7 @@ class CudaRegistration:
     def __init__(self, backend: CudaBackend) -> None:
         self._schedule = CudaSchedule(backend)
 
-    def register(
+    def register(  # noqa: PLR0913
         self,
         config: JNGOConfig,
         query: FeaturePyramid,

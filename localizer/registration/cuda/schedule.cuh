@@ -279,9 +279,9 @@ extern "C" __global__ void __launch_bounds__(512, 1) quality(const WinnerArgumen
 }
 
 // Whether one of `count` values is NaN or infinite: all exponent bits are set.
-template <class Bits>
-__device__ inline bool any_not_finite(const void* values, size_t count, Bits exponent) {
-    const Bits* bits = static_cast<const Bits*>(values);
+__device__ inline bool any_not_finite(const float* values, size_t count) {
+    const unsigned exponent = 0x7f800000u;
+    const unsigned* bits = reinterpret_cast<const unsigned*>(values);
     bool bad = false;
     for (size_t i = (size_t)blockIdx.x * blockDim.x + threadIdx.x; i < count;
          i += (size_t)gridDim.x * blockDim.x)
@@ -293,15 +293,10 @@ __device__ inline bool any_not_finite(const void* values, size_t count, Bits exp
 extern "C" __global__ void __launch_bounds__(256) all_finite(const FiniteArguments a) {
     const Level& level = *a.level;
     const size_t cells = (size_t)level.height * level.width, anchors = level.total;
-#if HALF_FEATURES
-    const unsigned short exponent = 0x7c00u;
-#else
-    const unsigned exponent = 0x7f800000u;
-#endif
-    bool bad = any_not_finite(level.features, cells * CHANNELS, exponent);
-    bad |= any_not_finite(level.anchor_features, anchors * CHANNELS, exponent);
-    bad |= any_not_finite(level.confidence, cells, 0x7f800000u);
-    bad |= any_not_finite(level.anchor_confidence, anchors, 0x7f800000u);
-    bad |= any_not_finite(level.points, 3 * anchors, 0x7f800000u);
+    bool bad = any_not_finite(level.features, cells * CHANNELS);
+    bad |= any_not_finite(level.anchor_features, anchors * CHANNELS);
+    bad |= any_not_finite(level.confidence, cells);
+    bad |= any_not_finite(level.anchor_confidence, anchors);
+    bad |= any_not_finite(level.points, 3 * anchors);
     if (bad) a.state->not_finite = 1;
 }

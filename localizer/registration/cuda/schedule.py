@@ -25,10 +25,10 @@ from localizer.registration.backend import (
 from localizer.registration.config import JNGOConfig
 from localizer.registration.cpu.reference import count_in_view
 from localizer.registration.cuda import layout
-from localizer.registration.cuda.backend import CudaBackend, to_precision
+from localizer.registration.cuda.backend import CudaBackend, as_floats
 from localizer.registration.cuda.curvature import (
-    geometry,
     last_settings,
+    level_without_features,
     winner_curvature,
     winner_motion,
 )
@@ -81,7 +81,7 @@ class CudaSchedule:
         self._timed = timed
         self._graph: tuple[GraphShape, Graph] | None = None
 
-    def run(
+    def run(  # noqa: PLR0913
         self,
         query: FeaturePyramid,
         camera: Camera,
@@ -120,7 +120,9 @@ class CudaSchedule:
             if len(found.scores) > 0 and found.finite:
                 points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
                 level = query.levels[last]
-                seen = geometry(points, *level_intrinsics(camera, level), level.confidence.shape)
+                seen = level_without_features(
+                    points, *level_intrinsics(camera, level), level.confidence.shape
+                )
                 found = self._with_curvature(found, shape, memory, last, seen, scale)
             if not self._timed:
                 return found
@@ -186,7 +188,7 @@ class CudaSchedule:
             self._backend.arena.buffer, levels, count, _survivors(config, count), finish
         )
 
-    def _upload(
+    def _upload(  # noqa: PLR0913
         self,
         memory: FrameMemory,
         query: FeaturePyramid,
@@ -277,24 +279,22 @@ def _packed_level(
     backend: CudaBackend, k: int, level: FeatureLevel, camera: Camera, anchors: Anchors
 ) -> NDArray[np.void]:
     """A level's description without its points; its features are copied to the device."""
-    put, half = backend.arena.put, backend.half
+    put = backend.arena.put
     packed = np.zeros((), dtype=layout.LEVEL)
-    packed["features"] = _query_address(backend, f"features {k}", level.features, half)
-    packed["confidence"] = _query_address(backend, f"confidence {k}", level.confidence, False)
-    packed["anchor_features"] = put(f"anchor features {k}", to_precision(anchors.features[k], half))
-    packed["anchor_confidence"] = put(
-        f"anchor confidence {k}", to_precision(anchors.confidence[k], False)
-    )
+    packed["features"] = _query_address(backend, f"features {k}", level.features)
+    packed["confidence"] = _query_address(backend, f"confidence {k}", level.confidence)
+    packed["anchor_features"] = put(f"anchor features {k}", as_floats(anchors.features[k]))
+    packed["anchor_confidence"] = put(f"anchor confidence {k}", as_floats(anchors.confidence[k]))
     packed["height"], packed["width"] = level.confidence.shape
     packed["focal"], packed["centre"] = level_intrinsics(camera, level)
     return packed
 
 
-def _query_address(backend: CudaBackend, name: str, values: object, half: bool) -> int:
+def _query_address(backend: CudaBackend, name: str, values: object) -> int:
     """Device address of query values: their own if they are on the device, else that of a copy."""
     if isinstance(values, DeviceArray):
-        return values.checked_address(np.float16 if half else np.float32)
-    return backend.arena.put(name, to_precision(np.asarray(values), half))
+        return values.checked_address(np.float32)
+    return backend.arena.put(name, as_floats(np.asarray(values)))
 
 
 def _packed_prior(constraint: QuadraticPrior) -> NDArray[np.void]:

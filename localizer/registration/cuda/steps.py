@@ -109,7 +109,7 @@ def _sharpening(shape: GraphShape, memory: FrameMemory) -> Iterator[KernelLaunch
     yield KernelLaunch("quality", searched - 1, 1, _FEW_THREADS, quality)
 
 
-def refine_launch(
+def refine_launch(  # noqa: PLR0913
     shape: GraphShape,
     memory: FrameMemory,
     level: int,
@@ -122,8 +122,8 @@ def refine_launch(
     factor: float = 0.0,
     free: bool = False,
 ) -> KernelLaunch:
-    """Launch of the LM kernel. alive: largest number of hypotheses; wanted: number of anchors;
-    factor: of the loss scale; free: without the prior, and its evaluations are not counted.
+    """Launch of the LM kernel. alive: largest number of hypotheses; wanted: number of anchors, 0:
+    all; factor: of the loss scale; free: without the prior, and its evaluations are not counted.
     """
     arguments = np.zeros((), dtype=layout.REFINE)
     arguments["level"], arguments["state"] = memory.level(level), memory.state

@@ -6,7 +6,6 @@ seasons belong to the rendered world.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from localizer.types import Float32, Image
 
 CONDITIONS = ("day", "dusk", "night", "fog", "rain", "snow")
-SKY_DEPTH_M = 4000.0  # haze distance given to pixels without a surface
+_SKY_DEPTH_M = 4000.0  # haze distance given to pixels without a surface
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ def apply_appearance(
     if a.lamps:
         image = _lamps(image, a.lamps, rng)
     if a.extinction_per_m > 0.0:
-        distance = np.where(depth > 0, depth, np.float32(SKY_DEPTH_M))
+        distance = np.where(depth > 0, depth, np.float32(_SKY_DEPTH_M))
         clear = np.exp(-np.float32(a.extinction_per_m) * distance)[..., None]
         haze = np.asarray(a.haze_color, np.float32) * np.float32(min(a.exposure, 1.0))
         image = image * clear + haze * (1 - clear)
@@ -173,38 +172,21 @@ def _snow_cover(image: Float32, depth: Float32, cover: float) -> Float32:
     return snowy
 
 
-@dataclass(frozen=True)
-class Lamp:
-    """A street lamp's light in the image: centre and radius in pixels, RGB colour, power."""
-
-    x: float
-    y: float
-    radius: float
-    color: tuple[float, float, float]
-    power: float
-
-
-def draw_lamps(count: int, width: int, height: int, rng: np.random.Generator) -> Iterator[Lamp]:
-    """Draw random lamps for one image."""
-    for _ in range(count):
-        radius = float(rng.uniform(0.01, 0.06)) * width
-        x, y = float(rng.uniform(0, width)), float(rng.uniform(0, height))
-        color = (1.0, float(rng.uniform(0.65, 0.95)), float(rng.uniform(0.3, 0.8)))
-        yield Lamp(x, y, radius, color, float(rng.uniform(0.3, 1.5)))
-
-
 def _lamps(image: Float32, count: int, rng: np.random.Generator) -> Float32:
     """Pools of lamp light on the ground, each with a bright core."""
     h, w = image.shape[:2]
     light = np.zeros((h, w, 3), np.float32)
-    for lamp in draw_lamps(count, w, h, rng):
-        radius, cx, cy = lamp.radius, lamp.x, lamp.y
+    for _ in range(count):
+        radius = float(rng.uniform(0.01, 0.06)) * w
+        cx, cy = float(rng.uniform(0, w)), float(rng.uniform(0, h))
+        color = (1.0, float(rng.uniform(0.65, 0.95)), float(rng.uniform(0.3, 0.8)))
+        power = float(rng.uniform(0.3, 1.5))
         x0, x1 = int(max(cx - 3 * radius, 0)), int(min(cx + 3 * radius + 1, w))
         y0, y1 = int(max(cy - 3 * radius, 0)), int(min(cy + 3 * radius + 1, h))
         dx = (np.arange(x0, x1, dtype=np.float32) - cx) / radius
         dy = (np.arange(y0, y1, dtype=np.float32) - cy) / radius
         pool = np.exp(-(dx[None] ** 2) - dy[:, None] ** 2)[..., None]
-        light[y0:y1, x0:x1] += pool * np.array(lamp.color, np.float32) * np.float32(lamp.power)
+        light[y0:y1, x0:x1] += pool * np.array(color, np.float32) * np.float32(power)
     lit: Float32 = image * (1.0 + 3.0 * light) + 0.12 * light**2
     return lit
 
@@ -212,17 +194,10 @@ def _lamps(image: Float32, count: int, rng: np.random.Generator) -> Float32:
 def _streaks(
     image: Float32, count: int, alpha: float, length: float, rng: np.random.Generator
 ) -> Float32:
-    cover = streak_cover(image.shape[:2], count, alpha, length, rng)[..., None]
-    return image * (1 - cover) + 0.85 * cover
-
-
-def streak_cover(
-    size: tuple[int, ...], count: int, alpha: float, length: float, rng: np.random.Generator
-) -> Float32:
-    """Opacity (H, W) of falling drops or flakes: short lines of one direction. alpha: opacity of
-    one line; length: mean, px of an image 256 px wide.
+    """Falling drops or flakes: short lines of one direction. alpha: opacity of one line; length:
+    mean, px of an image 256 px wide.
     """
-    h, w = size
+    h, w = image.shape[:2]
     layer: NDArray[np.uint8] = np.zeros((h, w), np.uint8)
     tilt = rng.normal(0.0, 0.3)
     starts = rng.uniform((0, 0), (w, h), (count, 2))
@@ -231,8 +206,9 @@ def streak_cover(
     for start, end in zip(starts, ends, strict=True):
         p, q = np.int32(start * 16), np.int32(end * 16)
         cv2.line(layer, p.tolist(), q.tolist(), 255, 1, cv2.LINE_AA, 4)
-    share: Float32 = layer.astype(np.float32) * np.float32(alpha / 255.0)
-    return share
+    cover = (layer.astype(np.float32) * np.float32(alpha / 255.0))[..., None]
+    streaked: Float32 = image * (1 - cover) + 0.85 * cover
+    return streaked
 
 
 def _optics(image: Float32, a: Appearance) -> Float32:
@@ -245,11 +221,11 @@ def _optics(image: Float32, a: Appearance) -> Float32:
     if a.defocus_px > 0.3:
         image = cv2.GaussianBlur(image, (0, 0), a.defocus_px)
     if a.motion_blur_px > 1.0:
-        image = cv2.filter2D(image, -1, motion_kernel(a.motion_blur_px, a.motion_blur_deg))
+        image = cv2.filter2D(image, -1, _motion_kernel(a.motion_blur_px, a.motion_blur_deg))
     return image
 
 
-def motion_kernel(length: float, angle_deg: float) -> Float32:
+def _motion_kernel(length: float, angle_deg: float) -> Float32:
     """Blur kernel of a straight motion of `length` pixels, with sum 1."""
     half = int(np.ceil(length / 2))
     size = 2 * half + 1

@@ -85,15 +85,15 @@ class Shell:
         )  # fmt: skip
 
     def wall(self, points: ArrayLike, eaves: float, levels: int = ALL_LEVELS) -> None:
-        """A facade in the building's style."""
+        """Add a facade in the building's style."""
         self.add(points, Cover.FACADE, self.base, self.accent, self.params, levels, eaves)
 
     def slope(self, points: ArrayLike) -> None:
-        """A roof surface in the building's style."""
+        """Add a roof surface in the building's style."""
         self.add(points, self.roof_cover, self.roof, self.accent, self.roof_params)
 
     def walls(self, x: tuple[float, float], y: tuple[float, float], top: float) -> None:
-        """Four walls of a box, from below the ground to `top`."""
+        """Add the four walls of a box, from below the ground to `top`."""
         foot = self.building.foot_z - self.building.base_z
         (x0, x1), (y0, y1) = x, y
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
@@ -104,7 +104,7 @@ class Shell:
         self, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float],
         side: Colour, lid: Colour, levels: int = NEAR_LEVELS,
     ) -> None:  # fmt: skip
-        """A plain box without a floor: chimneys, vents, lift houses."""
+        """Add a plain box without a floor: chimneys, vents, lift houses."""
         (x0, x1), (y0, y1), (z0, z1) = x, y, z
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
         for (ax, ay), (bx, by) in pairwise(ring):
@@ -117,7 +117,7 @@ class Shell:
         self, x: tuple[float, float], y: tuple[float, float], eaves: float, pitch: float,
         overhang: float = 0.5, along_x: bool = True,
     ) -> float:  # fmt: skip
-        """Walls with two gables and two slopes; returns the ridge height."""
+        """Add walls with two gables and two slopes; returns the ridge's z."""
         foot = self.building.foot_z - self.building.base_z
         (x0, x1), (y0, y1) = x, y
         if along_x:
@@ -153,7 +153,7 @@ class Shell:
         self, x: tuple[float, float], y: tuple[float, float], eaves: float, pitch: float,
         overhang: float = 0.6,
     ) -> float:  # fmt: skip
-        """Four walls under a hipped (or, if square, pyramid) roof; returns the ridge height."""
+        """Add four walls under a hipped (or, if square, pyramid) roof; returns the ridge's z."""
         self.walls(x, y, eaves)
         (x0, x1), (y0, y1) = x, y
         o = overhang
@@ -171,7 +171,7 @@ class Shell:
     def flat(
         self, x: tuple[float, float], y: tuple[float, float], top: float, parapet: float = 0.7
     ) -> None:
-        """Walls with a parapet around a flat roof."""
+        """Add walls with a parapet around a flat roof."""
         self.walls(x, y, top + parapet)
         (x0, x1), (y0, y1) = x, y
         self.slope([(x0, y0, top), (x1, y0, top), (x1, y1, top), (x0, y1, top)])

@@ -79,7 +79,7 @@ class LitScene:
 
 
 def compose(land: Land, prisms: Sequence[Prism]) -> Scene:
-    """Add the objects to the land."""
+    """A scene of a copy of the land with the objects on it."""
     height, albedo = land.height.copy(), land.albedo.copy()
     index = np.zeros(height.shape, np.int32)
     facades = np.zeros((len(prisms) + 1, 4), np.float32)
@@ -112,7 +112,7 @@ def light_scene(
 
 
 def openness(height: Float32) -> Float32:
-    """(n, n): visible share of the sky; less in concave places."""
+    """(n, n): factor of the sky's light, 0.55 to 1.15; less in concave places."""
     seen: Float32 = np.clip(
         1.0 + (height - cv2.GaussianBlur(height, (0, 0), 4.0)) * 0.06, 0.55, 1.15
     )

@@ -1,8 +1,8 @@
 """What the painting kernels share: covers, facade styles, light, and how a texel is coloured.
 
 Every texel knows its place in the world, and noise is a hash of that place, so textures do not
-repeat, tiles join without seams, and two visits differ only in what the `Look` says. Colours are
-sRGB values used as albedo; light is ``sky * ambient_occlusion + sun * cos(angle) * lit``.
+repeat, tiles join without seams, and two visits differ only in what the `VisitLook` says. Colours
+are sRGB values used as albedo; light is ``sky * ambient_occlusion + sun * cos(angle) * lit``.
 """
 
 from __future__ import annotations
@@ -64,5 +64,5 @@ class WindowLight:
 
 
 def new_image(height: int, width: int) -> Image:
-    """An empty RGB image."""
+    """An RGB image to paint all over: its pixels are arbitrary."""
     return np.empty((height, width, 3), np.uint8)

@@ -10,7 +10,7 @@ from localizer.synth.paint.noise import as_byte, noise
 
 @njit(cache=True, nogil=True, fastmath=True)
 def paint_crown(base, conifer, seed, shade, sun, sun_rgb, sky_rgb, out):  # type: ignore[no-untyped-def]
-    """A crown seen from above, (n, n, 3): azimuthal about the trunk, edge = underside."""
+    """Paint a crown seen from above into out (n, n, 3): about the trunk, edge = underside."""
     n = out.shape[0]
     half = n / 2
     for i in range(n):

@@ -280,7 +280,7 @@ def paint_surface(  # type: ignore[no-untyped-def]
     cover, origin, right, down, normal, gsd, width, length, base, accent, p, floor_z, eaves_z,
     seed, ceiling, ambient, light_west, light_north, light_gsd, sun, sun_rgb, sky_rgb, season, out,
 ):  # fmt: skip
-    """Colour and light of a planar chart: texel (i, j) lies at origin + right * s + down * t."""
+    """Paint a planar chart in its light: out's texel (i, j) is origin + right * s + down * t."""
     rgb = np.empty(3)
     cosine = max(0.0, normal[0] * sun[0] + normal[1] * sun[1] + normal[2] * sun[2])
     horizontal = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1])

@@ -16,7 +16,7 @@ _SHIFT = 4  # fractional bits of OpenCV's fixed-point vertices
 
 
 class Material(IntEnum):
-    """What covers the ground. The painter in `texture_ground` knows each by this number."""
+    """What covers the ground. The painter in `paint.ground` knows each by this number."""
 
     MEADOW = 0
     LAWN = 1
@@ -83,11 +83,11 @@ class GroundPlan:
         return len(self._material) - 1
 
     def polygon(self, layer: int, points: ArrayLike, region: int) -> None:
-        """Fill a polygon (N, 2)."""
+        """Add an area (N, 2), ENU m, of a region to a layer."""
         self._layers.setdefault(layer, []).append(PlanShape(np.asarray(points, float), 0.0, region))
 
     def stroke(self, layer: int, points: ArrayLike, width_m: float, region: int) -> None:
-        """Draw a line (N, 2) of a width in metres."""
+        """Add a line (N, 2), ENU m, of a width and region to a layer."""
         self._layers.setdefault(layer, []).append(
             PlanShape(np.asarray(points, float), width_m, region)
         )
@@ -118,7 +118,7 @@ def shape_bounds(shapes: list[PlanShape]) -> Array:
 def rasterize(
     shapes: Iterable[PlanShape], west: float, north: float, gsd_m: float, shape: tuple[int, int]
 ) -> NDArray[np.uint16]:
-    """Region ids (H, W) of a window whose top-left corner is (west, north)."""
+    """Region ids (H, W) of a window whose top-left corner is (west, north); 0 under no shape."""
     out = np.zeros(shape, np.uint16)
     one = 1 << _SHIFT
     for item in shapes:

@@ -96,7 +96,8 @@ def make_light(
 ) -> WindowLight:
     """Light of a window (top, left, height, width; pixels of the surface model).
 
-    dsm, ground: (H, W) heights with and without what stands on the ground.
+    dsm, ground: (H, W) heights with and without what stands on the ground; their top-left corner is
+    (dsm_west, dsm_north).
     """
     top, left, height, width = window
     # Everything that can throw a shadow into the window.

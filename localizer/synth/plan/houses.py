@@ -95,7 +95,7 @@ def _plan_second_row(planner: Planner, rng: np.random.Generator, outline: Array)
     ground.stroke(LAYER_GARDEN, bezier(outline[4], middle, end), 3.0, lane)
 
 
-def _plan_plot(
+def _plan_plot(  # noqa: PLR0913
     planner: Planner, rng: np.random.Generator, line: Array, s: int, lot: float, street: Street,
     row: bool, middle: Array,
 ) -> None:  # fmt: skip

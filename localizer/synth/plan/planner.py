@@ -84,7 +84,7 @@ class Planner:
     slots: list[tuple[float, float, float, float]] = field(default_factory=list)
     corners: list[Array] = field(default_factory=list)  # corners of painted pitches
 
-    def place(
+    def place(  # noqa: PLR0913
         self, rng: np.random.Generator, kind: Kind, centre: ArrayLike, angle: float, length: float,
         width: float, eaves: float, margin: float = 1.5,
     ) -> Building | None:  # fmt: skip
@@ -107,8 +107,8 @@ class Planner:
     def plant_tree(
         self, rng: np.random.Generator, xy: ArrayLike, size: float = 1.0, species: int | None = None
     ) -> None:
-        """Add one free-standing tree if there is room for its trunk. species: as of `Trees`; None:
-        drawn.
+        """Add one free-standing tree if there is room for its trunk. size: factor of the usual;
+        species: as of `Trees`; None: drawn.
         """
         p = np.asarray(xy, float).reshape(1, 2)
         if not self.taken.is_free(p, 0.8)[0]:
@@ -154,13 +154,13 @@ def frontages(planner: Planner, i: int, j: int) -> list[tuple[Array, Street]]:
 
 
 def main_axis(outline: Array) -> float:
-    """Direction (rad) of a cell's first side."""
+    """Direction (rad) of the first side of a cell; outline: of `Lattice.cell`."""
     edge = outline[8] - outline[0]
     return float(np.arctan2(edge[1], edge[0]))
 
 
 def line_frame(line: Array, s: int) -> tuple[Array, Array, Array]:
-    """Point, tangent and left normal of a line at metre s."""
+    """Point, tangent and left normal at metre s of a line with points at 1 m steps."""
     a, b = line[max(0, s - 3)], line[min(len(line) - 1, s + 3)]
     tangent = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
     return line[s], tangent, np.array([-tangent[1], tangent[0]])
@@ -180,7 +180,7 @@ def pair_grid(u: ArrayLike, v: ArrayLike) -> Array:
 def scatter_trees(
     planner: Planner, rng: np.random.Generator, outline: Array, count: int, size: float
 ) -> None:
-    """Up to `count` trees at random places inside an outline (N, 2)."""
+    """Plant up to `count` trees at random places inside an outline (N, 2). size: mean factor."""
     low, high = outline.min(0), outline.max(0)
     contour = outline.astype(np.float32)
     for xy in rng.uniform(low, high, (count, 2)):

@@ -241,7 +241,7 @@ def cut_ends(points: Array, start_m: float, end_m: float) -> Array | None:
 
 
 def paint_streets(net: StreetNet, plan: GroundPlan) -> None:
-    """Pavements, kerbs, carriageways, lane markings, stop lines and zebra crossings."""
+    """Add pavements, kerbs, carriageways, markings, stop lines and zebra crossings to the plan."""
     degree = np.bincount([n for s in net.streets for n in (s.a, s.b)], minlength=len(net.nodes))
     rank_at = np.full(len(net.nodes), 9)
     for street in net.streets:

@@ -115,7 +115,7 @@ def make_river(config: WorldConfig) -> River:
 
 
 def make_terrain(config: WorldConfig) -> Terrain:
-    """The height grid of a world: valley profile, rolling hills, carved river."""
+    """The height grid of a world: valley, hills, carved river; 0 m at the middle of the world."""
     rng = config.rng(2)
     river = make_river(config)
     n = round(config.size_m / TERRAIN_SPACING_M) + 1

@@ -282,7 +282,7 @@ def plan_park(planner: Planner, rng: np.random.Generator, i: int, j: int, outlin
 
 
 def park_along_streets(planner: Planner, rng: np.random.Generator) -> None:
-    """Parking slots along one kerb of each side street (rank 1)."""
+    """Add parking slots along one kerb of each side street (rank 1)."""
     for street in planner.net.streets:
         if street.rank != 1:
             continue
@@ -297,7 +297,7 @@ def park_along_streets(planner: Planner, rng: np.random.Generator) -> None:
 
 
 def plant_street_trees(planner: Planner, rng: np.random.Generator) -> None:
-    """Rows of trees along streets."""
+    """Plant rows of trees along streets."""
     for street in planner.net.streets:
         chance = (0.65, 0.2, 0.5)[street.rank]
         if rng.random() > chance:

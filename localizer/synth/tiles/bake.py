@@ -97,7 +97,9 @@ class Baker:
         self, level: int, place: tuple[int, int], west: float, north: float, ground: Image,
         mesh: ChartedMesh,
     ) -> TileNode:  # fmt: skip
-        """Write one tile: terrain with its image, and the mesh's faces of this level."""
+        """Write one tile: terrain with its image, and the mesh's faces of this level. place:
+        (column, row), for the file's name; west, north: its top-left corner.
+        """
         terrain = self.scene.plan.terrain
         side = self.scene.plan.config.size_m if level == ROOT else _SIDE_M[level]
         shown = mesh.at_level(level)
@@ -113,7 +115,7 @@ class Baker:
         if survey is not None:
             if level & NEAR_LEVELS:
                 world_m = self.scene.plan.config.size_m
-                faces = faces[survey.without_holes(positions, faces, world_m)]
+                faces = faces[survey.outside_holes(positions, faces, world_m)]
             positions = survey.displaced(positions)
         origin = np.array([west + side / 2, north - side / 2, float(points[:, 2].mean())])
         origin = np.round(origin, 3)
@@ -228,7 +230,7 @@ _baker: list[Baker] = []  # the baker of a worker process, set once by `start_wo
 
 
 def start_worker(scene_file: Path, folder: Path) -> None:
-    """Initialise a worker process."""
+    """Initialise a worker process for `bake_block` with the scene pickled in `scene_file`."""
     cv2.setNumThreads(1)
     with scene_file.open("rb") as file:
         _baker[:] = [Baker(pickle.load(file), folder)]

@@ -83,7 +83,9 @@ def tree_meshes(
     trees: Trees, chosen: NDArray[np.intp], ground_z: Array, shaded: NDArray[np.bool_],
     charts: list[Image], levels: tuple[int, ...] = (LEAF, MID, TOP),
 ) -> ChartedMesh:  # fmt: skip
-    """Crowns of the chosen trees, each with its ground_z (m) and whether it is shaded."""
+    """Crowns of the chosen trees, each with its ground_z (m) and whether it is shaded. charts: of
+    `crown_images`.
+    """
     parts = []
     half = _VARIANTS // 2
     small = trees.species[chosen] == 2

@@ -164,7 +164,7 @@ def _document(
 
 
 def write_tileset(path: Path, root: TileNode, ecef_from_enu: Pose, extras: dict[str, Any]) -> None:
-    """tileset.json with explicit REPLACE tiles; the root's transform places ENU on Earth."""
+    """Write tileset.json of explicit REPLACE tiles; the root's transform places ENU on Earth."""
     root.enclose()
     tile = _tile_json(root, np.zeros(3))
     shift = Pose(np.eye(3), root.origin)

@@ -60,7 +60,7 @@ class SurveyErrors:
         moved = [np.sin(along + phase[axis]).sum(axis=1) * scale for axis in range(3)]
         return np.asarray(positions + np.stack(moved, axis=1))
 
-    def without_holes(self, positions: Array, faces: NDArray[np.int64], side_m: float) -> Array:
+    def outside_holes(self, positions: Array, faces: NDArray[np.int64], side_m: float) -> Array:
         """Mask (F,) of the faces outside the survey's holes, in a world of `side_m`."""
         rng = np.random.default_rng([self.seed, 2])
         count = rng.poisson(self.holes_per_km2 * (side_m / 1000.0) ** 2)

@@ -154,7 +154,7 @@ class TrainingSample:
 
 
 def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> TrainingSample | None:
-    """Degrade the images by light, weather and sensor, then crop as `window_pair`."""
+    """Crop as `window_pair`; with `appearance`, images degraded by light, weather and sensor."""
     query, reference = pair.query, pair.reference
     if config.appearance:
         look = limit_haze(sample_appearance(rng, pair.condition), pair.query_depth)
@@ -168,7 +168,9 @@ def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Tra
 def window_pair(
     pair: Pair, config: LoaderConfig, rng: np.random.Generator
 ) -> TrainingSample | None:
-    """Crop windows of the same ground from a degraded pair, with anchors; None without overlap."""
+    """Crop windows of the same ground from a degraded pair, with anchors, and mirror half of the
+    crops. None if they share too little.
+    """
     width, height = config.crop
     camera, reference, query = pair.camera, pair.reference, pair.query
     T = relative_pose(pair)
@@ -210,7 +212,7 @@ def window_pair(
 
 
 def survey_appearance(rng: np.random.Generator) -> Appearance | None:
-    """The map's own sensor and light, on half of the references; None on the others."""
+    """Draw the map's own sensor and light for a reference; None for half of them."""
     if rng.random() >= 0.5:
         return None
     return replace(sample_appearance(rng, "day"), motion_blur_px=0.0, extinction_per_m=0.0)
@@ -235,7 +237,7 @@ def mirrored(sample: TrainingSample) -> TrainingSample:
 
 
 def collate(samples: list[TrainingSample]) -> Batch:
-    """Stack samples into tensors."""
+    """Stack samples into tensors; images in 0..1, all references before all queries."""
     images = np.stack([s.reference for s in samples] + [s.query for s in samples])
     # channels_last tensors corrupt memory in torch 2.13's CPU backward pass.
     pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2)))

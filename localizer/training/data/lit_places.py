@@ -1,4 +1,4 @@
-"""Places with several days of flight, lit and ready to render on a device."""
+"""Places with several days of flight, lit and ready to render."""
 
 from __future__ import annotations
 

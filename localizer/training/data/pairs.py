@@ -109,16 +109,25 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
                 visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
             lived, season = flight_day_scene(rng, place, visit, fixed)
-        pair = draw_views(rng, survey, lived, config)
-        if pair is None:
-            continue
-        reference, query, camera = pair
-        image, depth = render(survey, reference, camera)
-        seen, seen_depth = render(lived, query, camera, supersample=2)
-        yield Pair(
-            image, depth, seen, seen_depth, reference, query, camera, visit.weather,
-            visit.outdated, source, season,
-        )  # fmt: skip
+        views = draw_views(rng, survey, lived, config)
+        if views is not None:
+            yield render_pair(survey, lived, views, visit, source, season=season)
+
+
+def render_pair(
+    survey: LitScene, lived: LitScene, views: tuple[Pose, Pose, Camera], visit: FlightDay,
+    source: str, *, season: bool,
+) -> Pair:  # fmt: skip
+    """The reference's view of the survey and the query's view of the place later, without weather.
+    views: as `draw_views` returns them.
+    """
+    reference, query, camera = views
+    image, depth = render(survey, reference, camera)
+    seen, seen_depth = render(lived, query, camera, supersample=2)
+    return Pair(
+        image, depth, seen, seen_depth, reference, query, camera, visit.weather, visit.outdated,
+        source, season,
+    )  # fmt: skip
 
 
 def draw_place(
@@ -236,7 +245,9 @@ def named_conditions(rng: np.random.Generator, condition: str) -> FlightDay:
 def draw_views(
     rng: np.random.Generator, survey: LitScene, lived: LitScene, config: SceneConfig
 ) -> tuple[Pose, Pose, Camera] | None:
-    """Draw the poses of a pair with enough common view; None after a few failed tries."""
+    """Draw (reference pose, query pose, camera) with enough common view; None after a few failed
+    tries. survey, lived: the reference's scene and the query's.
+    """
     for _ in range(12):
         fov = rng.uniform(30, 90)
         camera = Camera.from_fov(config.width, config.height, fov)
@@ -261,7 +272,7 @@ def _viewpoint(rng: np.random.Generator, scene: LitScene, camera: Camera) -> tup
 
 
 def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Generator) -> Pose:
-    """A camera at `distance` from `target`, `pitch_rad` below the horizon, with some roll."""
+    """A camera at `distance` from `target`, `pitch_rad` below the horizon; draws heading, roll."""
     yaw, roll = rng.uniform(0, 2 * np.pi), np.radians(rng.normal(0, 3))
     flat = np.cos(pitch_rad)
     forward = np.array([flat * np.cos(yaw), flat * np.sin(yaw), -np.sin(pitch_rad)])

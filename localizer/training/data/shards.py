@@ -43,7 +43,7 @@ class PhotoSource:
 def write_shards(
     out: Path, seeds: range, scenes: SceneConfig, photos: PhotoSource | None, workers: int
 ) -> Iterator[Path]:
-    """Generate the shards of `seeds` that are not on disk yet; yields each as it is finished."""
+    """Generate the shards of `seeds` not on disk yet, while iterated; yields them in that order."""
     out.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not shard_path(out, seed).exists()]
     with ProcessPoolExecutor(workers, initializer=os.nice, initargs=(5,)) as pool:
@@ -58,7 +58,7 @@ def write_shards(
 
 
 def write_world_shards(out: Path, seeds: range, scenes: SceneConfig) -> Iterator[Path]:
-    """Generate the mesh worlds of `seeds` whose shards are not all on disk yet."""
+    """Generate, while iterated, all shards of those mesh worlds of which one is not on disk yet."""
     # The map's importers (GDAL, pyproj, trimesh) are not needed on a machine that only trains.
     from localizer.training.data.worlds import world_pairs
 

@@ -26,8 +26,8 @@ def open_stream(
         data.first_seed, data.scenes, data.active, data.steps_per_scene, data.flight_days
     )
     return LiveStream(
-        plan, scene_config(data), photo_source(data), loader, config.seed, workers.device,
-        rank=workers.rank, count=workers.count, workers=data.workers,
+        plan, scene_config(data), photo_source(data), loader, config.seed, rank=workers.rank,
+        count=workers.count, workers=data.workers,
     )  # fmt: skip
 
 

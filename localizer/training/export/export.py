@@ -38,7 +38,7 @@ class Parity:
 
 class Deployed(nn.Module):
     """The network as the flight path uses it: uint8 channels-last in, channels-last out. half:
-    computes in float16; its outputs are float32 all the same.
+    converts the network, in place, to float16; its outputs are float32 all the same.
     """
 
     def __init__(self, network: nn.Module, *, half: bool = False) -> None:
@@ -73,7 +73,8 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
     """Write `model` (ONNX) and its JSON; returns its checked difference from torch in float32.
 
     half: float16 inside, for GPUs; only for s0, because tiny's fixed channels need float32.
-    `ModelError` for a precision that the network does not support.
+    `ModelError` for a precision that the network does not support, or a difference above rounding;
+    then nothing is written.
     """
     network, config, progress = load_network(checkpoint)
     if half and not isinstance(network, S0Net):

@@ -1,4 +1,4 @@
-"""The training loop: both losses together, EMA, exact resumption, curves."""
+"""The training loop: both losses together, EMA, exact resumption."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ _log = logging.getLogger(__name__)
 
 
 class Trainer:
-    """A training run that can be stopped and resumed at any step with the same result.
+    """A training run that can be stopped and resumed at any step with the same result. It continues
+    from its checkpoint if there is one.
 
     Under torchrun every process takes its own batches and all take the mean step; the first process
     writes the files. Batch statistics are not averaged; the first process's are kept.
@@ -70,7 +71,7 @@ class Trainer:
         return self.config.output / f"{self.config.name}.pt"
 
     def run(self, steps: int | None = None, generating: Future[None] | None = None) -> None:
-        """Train up to the configured number of steps, or `steps` more, and write a checkpoint.
+        """Train up to the configured number of steps, or `steps` more, and write checkpoints.
 
         generating: generation of shards in parallel; its failure ends the run.
         """

@@ -69,7 +69,7 @@ class MobileOneBlock(nn.Module):
         y = self.main(x)
         return F.relu(y + x if self.residual else y)
 
-    def fuse(self) -> nn.Sequential:
+    def fused(self) -> nn.Sequential:
         """The same function as one convolution and a ReLU (evaluation statistics)."""
         inputs, outputs, size, stride, groups, dilation = self.shape
         fused = nn.Conv2d(
@@ -142,7 +142,7 @@ def fuse(model: nn.Module) -> nn.Module:
     """Replace every MobileOne block by its single convolution, in place; returns the model."""
     for name, child in model.named_children():
         if isinstance(child, MobileOneBlock):
-            setattr(model, name, child.fuse())
+            setattr(model, name, child.fused())
         else:
             fuse(child)
     return model

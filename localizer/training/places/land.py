@@ -29,7 +29,7 @@ _COVER = np.array(
 
 
 def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> TrainingPlace:
-    """Parcels, forest, water, a street net with buildings along it, scattered farms."""
+    """Draw a place of n x n cells: parcels, forest, water, a street net with buildings, farms."""
     height = noise(n, rng, 2, 5, 0.42) * _relief(rng, n, cell_m)
     cover, albedo = _parcels(rng, n)
     town = noise(n, rng, 3, 2, 0.5) > rng.uniform(-1.2, 1.2)
@@ -53,7 +53,7 @@ def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> Training
 def photo_place(
     rng: np.random.Generator, n: int, cell_m: float, layers: list[NDArray[np.uint8]]
 ) -> TrainingPlace:
-    """Real textures (each (n, n, 3) uint8, the same ground at different dates) over relief."""
+    """Lay textures (each (n, n, 3) uint8: the same ground on different dates) over drawn relief."""
     albedos = [(layer.astype(np.float32) / 255.0) * 0.85 for layer in layers]
     height = noise(n, rng, 2, 5, 0.4) * _relief(rng, n, cell_m)
     green = layers[0].astype(np.float32)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localizer.errors import SequenceError
 from localizer.pictures import read_rgb
-from localizer.plain_files import visible
+from localizer.plain_files import without_hidden
 
 _SEASONS = "neon_sjer_pairs"  # group whose plots were photographed at two dates
 
@@ -23,7 +23,7 @@ class PhotoLibrary:
     """
 
     def __init__(self, root: Path, groups: tuple[str, ...], *, held_out: bool = False) -> None:
-        self._files = {g: visible((root / g).rglob("*.jpg")) for g in groups}
+        self._files = {g: without_hidden((root / g).rglob("*.jpg")) for g in groups}
         if _SEASONS in self._files:
             plots = sorted({f.parent for f in self._files[_SEASONS]})
             mine = {p for k, p in enumerate(plots) if (k % 4 == 3) == held_out}
@@ -41,8 +41,8 @@ class PhotoLibrary:
             return self._seasons(rng, n, files)
         if group == "neon_forest":
             chosen = rng.choice(len(files), 9, replace=True)
-            return [_grid([read_photo(files[i]) for i in chosen], n, 3)]
-        image = read_photo(files[int(rng.integers(len(files)))])
+            return [_grid([read_rgb(files[i]) for i in chosen], n, 3)]
+        image = read_rgb(files[int(rng.integers(len(files)))])
         short = min(image.shape[:2])
         side = int(rng.uniform(0.55, 1.0) * short)
         y = int(rng.integers(0, image.shape[0] - side + 1))
@@ -57,14 +57,9 @@ class PhotoLibrary:
     ) -> list[NDArray[np.uint8]]:
         plots = sorted({f.parent for f in files})
         chosen = [plots[i] for i in rng.choice(len(plots), 9, replace=len(plots) < 9)]
-        dates = [visible(plot.glob("*.jpg")) for plot in chosen]
-        layers = [_grid([read_photo(d[k]) for d in dates], n, 3) for k in (0, -1)]
+        dates = [without_hidden(plot.glob("*.jpg")) for plot in chosen]
+        layers = [_grid([read_rgb(d[k]) for d in dates], n, 3) for k in (0, -1)]
         return layers[:: int(rng.choice((-1, 1)))]
-
-
-def read_photo(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a photo's file; `SequenceError` if it is no image."""
-    return read_rgb(path)
 
 
 def _grid(images: list[NDArray[np.uint8]], n: int, per_side: int) -> NDArray[np.uint8]:

@@ -73,7 +73,8 @@ class Guidance:
     def fly(self, target: Vector) -> None:
         """Follow a straight leg to `target`, NED metres. The leg starts at the present set point,
         or at the vehicle if that set point is 20 m away or more. Nothing changes if the present leg
-        ends at `target`. The heading turns to the leg's if WP_YAW_BEHAVIOR wants it.
+        ends at `target`; a landing goes on. The heading turns to the leg's if WP_YAW_BEHAVIOR wants
+        it.
         """
         old, here = self.set_point, self.estimator.position
         if old is not None and old.end == target:
@@ -92,7 +93,7 @@ class Guidance:
             self.yaw_target = atan2(east, north)
 
     def arrived(self) -> bool:
-        """Whether the vehicle is within the waypoint radius of the leg's end."""
+        """Whether set point and vehicle (WPNAV_RADIUS) are at the leg's end; True without a leg."""
         if self.set_point is None:
             return True
         end = self.set_point.end
@@ -101,8 +102,8 @@ class Guidance:
         return self.set_point.arrived and gap < radius
 
     def steer(self, home_down: float, *, level_when_lost: bool) -> Array:
-        """Attitude quaternion and total thrust (5,) for the next tick. They follow the set point
-        (in a landing: descend) and hold the heading target.
+        """Attitude quaternion and total thrust (5,) for the next tick, called once in it. They
+        follow the set point, which moves on (in a landing: descend), and hold the heading target.
 
         home_down: NED down coordinate of home, m. level_when_lost: without a valid position, stay
         level and drift with the wind.

@@ -63,8 +63,8 @@ class FlightModes:
     # --- requests ----------------------------------------------------------------------------
 
     def set_mode(self, mode: Mode) -> bool:
-        """Change the flight mode; True if it was changed. Refused with a STATUSTEXT: a mode that
-        needs a position, without one while armed; AUTO without a mission.
+        """Change the flight mode; True if it is then the active one. Refused with a STATUSTEXT: a
+        mode that needs a position, without one while armed; AUTO without a mission.
         """
         if mode is self.mode:
             return True
@@ -163,7 +163,9 @@ class FlightModes:
 
     @property
     def flying(self) -> bool:
-        """Whether the vehicle has left the ground."""
+        """Whether a take-off has begun and no landing ended (STABILIZE: whether it is in the
+        air).
+        """
         return self._flying
 
     @property
@@ -174,7 +176,9 @@ class FlightModes:
     # --- every tick --------------------------------------------------------------------------
 
     def update(self, time_s: float) -> Array:
-        """Attitude quaternion and total thrust (5,) for the next tick."""
+        """Attitude quaternion and total thrust (5,) for the next tick. Called once a tick: it sets
+        home before arming, flies the mode, and disarms after a landing.
+        """
         self._time = time_s
         self._set_home()
         if self.armed:

@@ -69,7 +69,7 @@ class AidedFilter:
         return True
 
     def force_position(self, north_m: float, east_m: float, sigma_m: float) -> bool:
-        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: reset the position. False while aided (1 s)."""
+        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: reset the position; False if aided within 1 s."""
         if self.gated.now_ms - self.gated.clock.position_pass <= 1000 or self.origin is None:
             return False
         self.gated.reset_position(north_m, east_m, sigma_m**2)

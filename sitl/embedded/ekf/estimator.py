@@ -79,7 +79,9 @@ class Estimator:
         return self.sources.set_origin(origin)
 
     def add(self, measurement: Measurement, time_ms: int) -> None:
-        """Queue a measurement taken at time_ms since boot (at the delayed horizon if older)."""
+        """Queue a measurement taken at time_ms since boot (at the delayed horizon if older). GNSS
+        is checked at once, and may set the origin.
+        """
         if isinstance(measurement, GpsData):
             self.sources.check_gps(measurement)
         heapq.heappush(

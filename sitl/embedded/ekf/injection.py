@@ -159,7 +159,9 @@ class ExternalNavInput:
         return (times[-1] - times[0]) / (len(times) - 1) <= _GPS_MAX_GAP_MS
 
     def gps_input(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
-        """Take GPS_INPUT of gps_id 0 or 1 if GPS1_TYPE or GPS2_TYPE, respectively, is 14."""
+        """Take GPS_INPUT of gps_id 0 or 1 if GPS1_TYPE or GPS2_TYPE, respectively, is 14; gps_id 1
+        is fused only while the simulated receiver has no fix.
+        """
         receiver = f"GPS{message.gps_id + 1}"
         if message.gps_id > 1 or self._parameters[f"{receiver}_TYPE"] != _GPS_MAVLINK:
             return

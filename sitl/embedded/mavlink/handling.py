@@ -20,7 +20,7 @@ def location_of(
     home: Location | None, frame: int, x: int, y: int, altitude: float
 ) -> Location | None:
     """Location of a message's coordinates (degrees * 1e7, m) in a global MAV_FRAME. None for other
-    frames, or for a relative altitude without home.
+    frames, or without home.
     """
     if frame not in _GLOBAL_FRAMES or home is None:
         return None

@@ -47,7 +47,7 @@ class SerialPort:
         self._mav.robust_parsing = True
 
     def send(self, message: Any) -> None:
-        """Queue one of the autopilot's own messages."""
+        """Queue one of the autopilot's own messages; dropped without a client, or if it stalls."""
         if self.client is not None:
             self._queue(message.pack(self._mav))
             self._mav.seq = (self._mav.seq + 1) % 256
@@ -73,7 +73,7 @@ class SerialPort:
             self.due[message_id] = 0.0
 
     def due_messages(self, now_s: float) -> list[int]:
-        """Ids of streamed messages that are due, ATTITUDE before the truth messages."""
+        """Ids of streamed messages that are due, noted as sent; ATTITUDE before the truth's."""
         if self.client is None:
             return []
         ready = []
@@ -142,7 +142,7 @@ class SerialPort:
 
 
 class MavlinkServer:
-    """All links of the vehicle."""
+    """All links of the vehicle. `PortError` if a port cannot be listened on."""
 
     def __init__(self, ports: tuple[int, ...], system_id: int) -> None:
         self.system_id = system_id

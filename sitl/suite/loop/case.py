@@ -8,12 +8,12 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import StrictModel
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioError, ScenarioLeg
+from sitl.suite.case import load_case
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.ramp import Ramp
 
@@ -224,7 +224,7 @@ def load_loop_cases(
     files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     if not files:
         raise ScenarioError(f"{folder}: holds no flights (NAME.yaml)")
-    cases = {name: _load(path) for name, path in files.items()}
+    cases = {name: load_case(path, LoopCase) for name, path in files.items()}
     groups = {"normal": tuple(name for name, case in cases.items() if case.is_normal)}
     chosen = list(names) or list(files)
     unknown = [name for name in chosen if name not in cases and name not in groups]
@@ -232,10 +232,3 @@ def load_loop_cases(
         raise ScenarioError(f"no {', '.join(unknown)} in {folder}; there are: {', '.join(files)}")
     wanted = [single for name in chosen for single in groups.get(name, (name,))]
     return tuple(cases[name] for name in dict.fromkeys(wanted))
-
-
-def _load(path: Path) -> LoopCase:
-    try:
-        return validated(LoopCase, {"name": path.stem, **read_settings(path, ScenarioError)})
-    except SettingsError as error:
-        raise ScenarioError(f"{path}:\n{error}") from error

@@ -19,7 +19,7 @@ while time.monotonic() < end:
 
 
 class CpuLoad:
-    """CPU load: busy processes that share one processor with the companion."""
+    """CPU load from now on: busy processes that share one processor with the companion."""
 
     def __init__(self, load: Load, companion: LoopCompanion) -> None:
         self._companion = companion

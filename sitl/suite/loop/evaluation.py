@@ -11,15 +11,12 @@ from itertools import pairwise
 import numpy as np
 
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.reading import alert_of
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop.case import Expectation
 from sitl.suite.loop.companion import Health
 from sitl.suite.record import Text
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
-_AUTOPILOT = 1  # component id
-_WARNING = 4  # MAV_SEVERITY; lower is worse
 _FALSE_M = 5.0
 
 
@@ -53,27 +50,6 @@ class LoopSample:
 
 
 @dataclass(frozen=True)
-class LoopText:
-    """A status text and the MAVLink component that sent it."""
-
-    at_s: float
-    component: int
-    severity: int
-    text: str
-
-    @property
-    def alert(self) -> AlertId | None:
-        """The companion's alert, raised or cleared; None for texts of the autopilot."""
-        read = alert_of(self.text) if self.component != _AUTOPILOT else None
-        return None if read is None else read[0]
-
-    @property
-    def is_warning(self) -> bool:
-        """Whether it is a warning of the companion, or worse."""
-        return self.component != _AUTOPILOT and self.severity <= _WARNING
-
-
-@dataclass(frozen=True)
 class RestartTimes:
     """Seconds from the end of a companion until its successor works; infinite: never.
 
@@ -96,7 +72,7 @@ class LoopRecord:
     """
 
     samples: tuple[LoopSample, ...]
-    texts: tuple[LoopText, ...]
+    texts: tuple[Text, ...]
     fix_errors_m: tuple[float, ...]
     pace: float = 1.0
     stall_s: float = 0.0
@@ -249,7 +225,7 @@ def evaluate(
     return tuple(held)
 
 
-def _repeated(texts: Sequence[LoopText], most: int) -> LoopExpectationResult:
+def _repeated(texts: Sequence[Text], most: int) -> LoopExpectationResult:
     """Check that no alert was raised more than `most` times, because operators ignore texts that
     alternate.
     """
@@ -260,24 +236,21 @@ def _repeated(texts: Sequence[LoopText], most: int) -> LoopExpectationResult:
     )
 
 
-def _reported(texts: Sequence[LoopText], of: AlertId) -> LoopExpectationResult:
+def _reported(texts: Sequence[Text], of: AlertId) -> LoopExpectationResult:
     found = [t for t in texts if t.alert is of]
     at = f"at {found[0].at_s:.1f} s" if found else "never"
     return LoopExpectationResult(f"reports {of.words}", bool(found), at)
 
 
-def _timed(texts: Sequence[LoopText], of: AlertExpectation) -> LoopExpectationResult:
-    plain = (
-        Text(t.at_s, "vehicle" if t.component == _AUTOPILOT else "bridge", t.text) for t in texts
-    )
-    found = of.evaluate_texts(plain)
+def _timed(texts: Sequence[Text], of: AlertExpectation) -> LoopExpectationResult:
+    found = of.evaluate_texts(texts)
     span = "never" if of.absent else f"from {of.from_s:g} to {of.to_s:g} s"
     return LoopExpectationResult(
         f"{of.alert.words} {span}", found.ok, found.what, listed=not of.absent
     )
 
 
-def _warned(texts: Sequence[LoopText], of: AlertId) -> LoopExpectationResult:
+def _warned(texts: Sequence[Text], of: AlertId) -> LoopExpectationResult:
     told = [t.at_s for t in texts if t.alert is of]
     worse = [t.at_s for t in texts if t.alert in (AlertId.DEGRADED, AlertId.BRIDGING, AlertId.LOST)]
     warned, ended = min(told, default=math.inf), min(worse, default=math.inf)

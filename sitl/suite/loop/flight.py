@@ -33,9 +33,10 @@ from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import CpuLoad
-from sitl.suite.loop.evaluation import LoopRecord, LoopSample, LoopText, RestartTimes
+from sitl.suite.loop.evaluation import LoopRecord, LoopSample, RestartTimes
 from sitl.suite.loop.terrain_file import terrain_file
 from sitl.suite.ramp import RunningRamp
+from sitl.suite.record import Text
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
@@ -187,7 +188,7 @@ class _LoopFlight:
     def record(self) -> LoopRecord:
         """The data for the expectations; call it after the processes have ended."""
         texts = tuple(
-            LoopText((t.time_ns - self._start_ns) * 1e-9, t.component, t.severity, t.text)
+            Text((t.time_ns - self._start_ns) * 1e-9, t.component, t.severity, t.text)
             for t in self._pilot.record.texts
             if self._start_ns <= t.time_ns <= self._end_ns
         )

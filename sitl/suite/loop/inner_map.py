@@ -14,8 +14,9 @@ _BEYOND_M = 50.0  # what may stick out of a tile's square (a tree that sticks ou
 def inner_map(whole: Path, reach_m: float) -> Path:
     """Write a cache of the tiles within reach_m of the world's centre; returns its path.
 
-    whole: the cache of all tiles; the smaller one is made once, beside it. Coarse tiles that reach
-    further are left out, so nothing is shown beyond reach_m.
+    whole: the cache of all tiles, beside the folder `survey` of their tileset; the smaller one is
+    made once, beside it. Coarse tiles that reach further are left out, so nothing is shown beyond
+    reach_m.
     """
     survey, cache = whole.parent / "survey", whole.with_name(f"{whole.name}-{reach_m:.0f}")
     if not (cache / "manifest.json").exists():

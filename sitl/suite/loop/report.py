@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.evaluation import LoopExpectationResult, LoopFigures
@@ -78,11 +78,12 @@ def false_alarm_rate(rows: Sequence[LoopRow]) -> FalseAlarms | None:
         return None
     n, hits = len(normal), sum(bool(row.alarms) for row in normal)
     flown = [row.figures for row in normal if row.figures is not None]
+    share = binomtest(hits, n).proportion_ci()
     return FalseAlarms(
         flights=n,
         with_alarm=hits,
-        low=0.0 if hits == 0 else float(beta.ppf(0.025, hits, n - hits + 1)),
-        high=1.0 if hits == n else float(beta.ppf(0.975, hits + 1, n - hits)),
+        low=float(share.low),
+        high=float(share.high),
         hours=sum(f.seconds for f in flown) / 3600.0,
         told_s=sum(f.told_s for f in flown),
     )

@@ -143,6 +143,9 @@ def test_info_says_where_the_map_is_and_writes_its_outline(cache, tmp_path):
     assert "EGM96 there: 47.75" in result.output
     refused = run("info", cache.path, "--kml", "/dev/full")
     assert "--kml" in str(refused.exception)
+    missing = run("info", cache.path, "--geojson", tmp_path / "none" / "area.geojson")
+    assert "--geojson" in missing.output
+    assert "no such folder" in " ".join(missing.output.replace("│", " ").split())
     (feature,) = json.loads(geojson.read_text())["features"]
     ring = np.array(feature["geometry"]["coordinates"][0])
     assert ring[0].tolist() == ring[-1].tolist()

@@ -21,7 +21,7 @@ from stanag4609.st0601 import decode_uas_local_set
 from companion.config import CompanionConfig, KlvConfig, RecordConfig
 from companion.errors import RecordError, StreamOpenError
 from companion.flight.recorder import RecordKeeper
-from companion.klv.metadata import KlvContext, picture_fields
+from companion.klv.metadata import KlvContext, frame_fields
 from companion.klv.relay import KlvRelay
 from companion.reporting.klv_recording import describe_recording
 from companion.sources import SourceSettings, VideoFileSource
@@ -102,7 +102,7 @@ def test_the_fields_of_a_picture_are_where_it_was_taken_and_what_it_shows():
     """A camera at 100 m over flat ground, looking down: everything can be told by hand."""
     target = TargetFix("t", np.array([10.0, -20.0, 0.0]), np.diag([0.5, 0.5, 4.0]), None, 0)
     body = matrix_from_euler(0.0, 0.1, np.radians(30.0))
-    fields = picture_fields(estimate(0, east=50.0), SCENE, body, target)
+    fields = frame_fields(estimate(0, east=50.0), SCENE, body, target)
     frame = SCENE.frame
     under = frame.position(np.array([50.0, 0.0, 0.0]))
     assert fields[23] == pytest.approx(under.latitude_deg, abs=1e-8)
@@ -126,9 +126,9 @@ def test_the_fields_of_a_picture_are_where_it_was_taken_and_what_it_shows():
     np.testing.assert_allclose((body @ on_body)[:, 2], [-1, 0, 0], atol=2e-5)
     assert fields[45] == pytest.approx(2.146 * np.sqrt(0.5))
     assert fields[46] == pytest.approx(1.645 * 2.0)
-    unknown = picture_fields(estimate(0), SCENE)
+    unknown = frame_fields(estimate(0), SCENE)
     assert not {5, 6, 7, 18, 19, 20, 40, 41, 42} & set(unknown)
-    level = picture_fields(estimate(0, tilt=np.pi / 2), SCENE)
+    level = frame_fields(estimate(0, tilt=np.pi / 2), SCENE)
     assert not {21, 23, 24, 25, 26, 40} & set(level)
 
 

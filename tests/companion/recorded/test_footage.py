@@ -68,7 +68,7 @@ def write_video(path, seconds=4.0, klv=None, rates=(10, 10), size=(160, 120)):
 
 def test_a_folder_of_photos_needs_nothing_else(tmp_path):
     flight = read_footage(_survey(tmp_path / "p"), FootageOptions(tmp_path / "w", frames=3))
-    assert (flight.kind, len(flight.frames), flight.located) == ("photos", 3, 3)
+    assert (flight.kind, len(flight.frames), flight.located_count) == ("photos", 3, 3)
     assert "3 of 4 photos are used" in flight.notes[0]
     assert flight.frames[0].telemetry.view.nadir_angle_deg < 1.0
     assert flight.camera.focal_percent == 2.0
@@ -173,7 +173,7 @@ def test_photos_that_another_program_turned_are_refused(tmp_path):
     write_photo(folder / "a.jpg", exif=exif, size=(40, 30))
     (folder / "places.csv").write_text("name,lat,lon\na.jpg,0.0,0.0\n")
     flight = read_footage(folder, FootageOptions(tmp_path / "w"))
-    assert flight.located == 0
+    assert flight.located_count == 0
     assert "1 of 1 frames have no position" in flight.notes
 
 
@@ -328,7 +328,7 @@ def test_a_sequence_is_footage_and_photos_with_tags_are_a_sequence(tmp_path):
 def test_the_sample_of_the_tutorial_is_complete(tmp_path):
     sample = Path(__file__).parents[3] / "examples" / "footage"
     flight = read_footage(sample / "photos", FootageOptions(tmp_path / "w"))
-    assert (len(flight.frames), flight.located, flight.notes) == (8, 8, ())
+    assert (len(flight.frames), flight.located_count, flight.notes) == (8, 8, ())
     assert all(f.telemetry.view is not None for f in flight.frames)
     assert (sample / "dsm.tif").is_file()
     assert (sample / "ortho.tif").is_file()

@@ -13,7 +13,7 @@ from companion.cli.commands import app
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
-from companion.settings_file import settings
+from companion.settings_file import settable_fields
 from companion.setup.reference import reference
 from companion.setup.write import differing_settings
 from localizer.errors import MapCacheError
@@ -74,7 +74,7 @@ def test_the_reference_is_a_valid_deployment_of_true_defaults():
     text = reference()
 
     def names(model: type[BaseModel]) -> set[str]:
-        return set(settings(model))
+        return set(settable_fields(model))
 
     assert all(f"{name}:" in text for name in names(CompanionConfig))
     assert "delay_ms: 100.0" in text

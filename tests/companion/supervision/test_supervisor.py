@@ -62,7 +62,7 @@ class Scripted:
         self.looks -= 1
         return None if self.looks >= 0 else self.code
 
-    def interrupt(self, number: int) -> None:
+    def send_signal(self, number: int) -> None:
         self.signals.append(number)
         self.looks, self.code = 0, 0
 
@@ -406,7 +406,7 @@ def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:
     standby.dismiss()
     assert standby.wait(0.0) == 7
     standby.release()  # harmless
-    standby.interrupt(signal.SIGTERM)
+    standby.send_signal(signal.SIGTERM)
 
 
 @pytest.mark.parametrize(("code", "said"), [(-9, "SIGKILL"), (1, "exit 1"), (-200, "signal 200")])

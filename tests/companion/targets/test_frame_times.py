@@ -23,7 +23,7 @@ def test_each_of_the_three_ways_to_name_a_frame():
     told: list[Detection] = []
     times = FrameTimes(told.append)
     times.add_frame(Frame(IMAGE, 1000, CAMERA, 7))
-    times.picture(Fraction(3003, 90_000), 2000)
+    times.frame_exposed(Fraction(3003, 90_000), 2000)
     for way in ('"time_ns": 500', '"sequence": 7', '"pts_s": 0.0333'):
         times.add_detection(*_asked(f'{{"target_id": "car", "u": 1.5, "v": 2.5, {way}}}'))
     assert told == [Detection("car", t, 1.5, 2.5) for t in (500, 1000, 2000)]
@@ -36,22 +36,22 @@ def test_a_detection_may_come_before_its_frame_and_none_is_given_anothers_time()
     car = Detection("car", 0, 1.0, 2.0)
     times.add_detection(car, FrameName(pts_s=0.1))
     times.add_detection(car, FrameName(sequence=3))
-    times.picture(Fraction(9180, 90_000), 10)  # 2 ms beside
+    times.frame_exposed(Fraction(9180, 90_000), 10)  # 2 ms beside
     times.add_frame(Frame(IMAGE, 20, CAMERA, 2))
     assert told == []
     times.add_frame(Frame(IMAGE, 30, CAMERA, 3))
-    times.picture(Fraction(1, 10), 40)
+    times.frame_exposed(Fraction(1, 10), 40)
     assert [d.time_ns for d in told] == [30, 40]
 
 
 def test_after_a_reconnection_old_presentation_times_mean_nothing():
     told: list[Detection] = []
     times = FrameTimes(told.append)
-    times.picture(Fraction(1), 10)
+    times.frame_exposed(Fraction(1), 10)
     times.begin(None)
     times.add_detection(Detection("car", 0, 1.0, 2.0), FrameName(pts_s=1.0))
     assert told == []
-    times.picture(Fraction(1), 99)
+    times.frame_exposed(Fraction(1), 99)
     assert [d.time_ns for d in told] == [99]
 
 
@@ -62,7 +62,7 @@ def test_what_waits_for_a_picture_of_the_old_connection_gets_none_of_the_new():
     times.add_detection(Detection("car", 0, 1.0, 2.0), FrameName(pts_s=5.0))
     times.add_detection(Detection("van", 0, 1.0, 2.0), FrameName(sequence=3))
     times.begin(None)
-    times.picture(Fraction(5), 99)
+    times.frame_exposed(Fraction(5), 99)
     assert told == []
     assert times.unmatched == 1
     times.add_frame(Frame(IMAGE, 120, CAMERA, 3))  # frames are counted on

@@ -35,7 +35,7 @@ class Operator:
         )
         self.begin = self.population.begin
         self.clicks = ClickPolicy(self, self.alerts.append, self.config)
-        self._flown = flown
+        self.flown = flown
         self.time_ms = self.count = 0
 
     def forget(self, names):
@@ -46,7 +46,7 @@ class Operator:
 
     def fly(self, frames=1, state=TrackingState.TRACKING):
         for _ in range(frames):
-            seen = estimate(self._flown(self.time_ms / 1e3), self.time_ms * MS, state)
+            seen = estimate(self.flown(self.time_ms / 1e3), self.time_ms * MS, state)
             self.clicks.add_estimate(seen)
             if state is TrackingState.TRACKING:
                 self.population.predict(seen)
@@ -99,7 +99,7 @@ def test_forty_clicks_and_rectangles_with_stops_between_are_each_told_under_thei
         first = told[0]
         # In the frame that the operator saw, not in the one that was newest when he clicked.
         assert abs(first.estimate.exposure_time_ns - seen_ns) <= 20 * MS
-        exact = estimate(operator._flown(seen_ns * 1e-9), seen_ns)
+        exact = estimate(operator.flown(seen_ns * 1e-9), seen_ns)
         back = np.array(pixel_of(exact, first.fix.position_world))
         assert (
             np.linalg.norm(back - pixel)

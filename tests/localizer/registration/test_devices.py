@@ -112,7 +112,7 @@ def test_missing_compiler_library_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cuda.bindings", SimpleNamespace(nvrtc=fake))
     monkeypatch.setitem(sys.modules, "cuda.bindings.nvrtc", fake)
     with pytest.raises(CudaUnavailableError, match=r"NVRTC.*extra `gpu`"):
-        compiler.compile_kernels(32, False, (9, 0))
+        compiler.compile_kernels(32, (9, 0))
 
 
 def test_a_gpu_that_fails_in_flight_leaves_the_cpu(monkeypatch, caplog, scene, prior):

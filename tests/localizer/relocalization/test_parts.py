@@ -22,7 +22,7 @@ from localizer.relocalization.search import (
     _fitted,
     above_roofs,
     ground_of,
-    scales,
+    trial_heights,
 )
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
@@ -72,7 +72,7 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
     near = replace(asked, region=SearchRegion.circle(np.array([1700.0, -200.0]), 50.0))
     assert ground_of(flat, near).max() == 80  # within what is seen, if not below
     off = replace(asked, region=SearchRegion.circle(np.array([9000.0, 0.0]), 50.0))
-    assert len(scales(off, ground_of(flat, off), CONFIG)) == 0
+    assert len(trial_heights(off, ground_of(flat, off), CONFIG)) == 0
     assert ground_of(flat, query()).shape == flat.ground.shape
 
 
@@ -230,12 +230,12 @@ def test_a_turned_rectification_is_the_one_of_the_turned_heading():
 
 def test_heights_cover_the_ground_and_its_error():
     ground = np.array([[0.0, 20.0], [np.nan, -5.0]], np.float32)
-    found = scales(query(), ground, CONFIG)
+    found = trial_heights(query(), ground, CONFIG)
     reach = np.sqrt(CONFIG.scale_step)
     assert found[0] <= 78 * reach
     assert found[-1] >= 107 / reach
     assert (found[1:] / found[:-1] <= CONFIG.scale_step + 1e-9).all()
-    assert len(scales(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
+    assert len(trial_heights(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
 
 
 def test_the_height_is_above_roofs_that_the_map_lacks():
@@ -244,7 +244,7 @@ def test_the_height_is_above_roofs_that_the_map_lacks():
     flat.ground[:] = ((0.0, 1.0), (np.nan, -1.0))
     asked = query(height_m=120.0, height_sigma_m=3.0)
     over = above_roofs(asked, flat, 8.0, CONFIG)
-    seen, bare = (scales(each, flat.ground, CONFIG) for each in (over, asked))
+    seen, bare = (trial_heights(each, flat.ground, CONFIG) for each in (over, asked))
     assert len(seen) == len(bare) == 1  # takes no longer
     assert 120 / CONFIG.scale_step < seen[0] < bare[0] - 4  # bare ground stays within a step
     assert above_roofs(asked, flat, 2.0, CONFIG).height_m == 118

@@ -23,7 +23,7 @@ def _covariance(turns_deg: list[float]) -> np.ndarray:
     target = StaticTarget(100.0)  # rays alone
     for turn in turns_deg:
         assert target.update(_ray(turn), (SURFACE,))
-    return target.places()[0].covariance
+    return target.hypotheses()[0].covariance
 
 
 def test_of_too_many_viewpoints_none_counts_twice():

@@ -50,7 +50,7 @@ def test_filtered_errors_match_the_filters_own_covariance():
             R = np.diag([0.09] * 3 + [0.005**2] * 3)
             ahead = motion.predict(state, round(k * dt * SECOND), CONFIG)
             state = motion.update(ahead, seen, R)
-        nees.append(motion.mahalanobis_squared(state.prior, truth))
+        nees.append(state.prior.mahalanobis_squared(truth))
     # The rotation never accelerates here, so its part is conservative.
     assert 2.0 < np.mean(nees) < 8.0
 
@@ -119,12 +119,12 @@ def test_a_turn_that_begins_passes_the_gate_only_where_it_is_told():
     time_ns = 21 * SECOND // 10
     blind = motion.predict(state, time_ns, CONFIG).prior
     told = motion.predict(state, time_ns, CONFIG, turn).prior
-    assert motion.mahalanobis_squared(blind, Pose(turn, np.zeros(3)), covariance) > chi2_threshold
-    assert motion.mahalanobis_squared(told, Pose(turn, np.zeros(3)), covariance) < chi2_threshold
+    assert blind.mahalanobis_squared(Pose(turn, np.zeros(3)), covariance) > chi2_threshold
+    assert told.mahalanobis_squared(Pose(turn, np.zeros(3)), covariance) < chi2_threshold
     beside = Pose(so3_exp([0.0, 0.0, np.radians(1.5)]), np.zeros(3))
     steady = motion.predict(state, time_ns, CONFIG, np.eye(3)).prior
-    assert motion.mahalanobis_squared(blind, beside, covariance) < chi2_threshold
-    assert motion.mahalanobis_squared(steady, beside, covariance) > chi2_threshold
+    assert blind.mahalanobis_squared(beside, covariance) < chi2_threshold
+    assert steady.mahalanobis_squared(beside, covariance) > chi2_threshold
 
 
 def test_a_turns_error_grows_with_its_rate_and_with_time():

@@ -26,7 +26,7 @@ PLAN = LivePlan(first_seed=3000, places=50, active=2, steps_per_place=2, flight_
 
 
 def opened(loader: LoaderConfig = LOADER, **changes: int) -> LiveStream:
-    return LiveStream(PLAN, SCENES, None, loader, 5, torch.device("cpu"), **changes)
+    return LiveStream(PLAN, SCENES, None, loader, 5, **changes)
 
 
 @pytest.fixture(scope="module")

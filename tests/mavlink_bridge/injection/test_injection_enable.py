@@ -38,18 +38,18 @@ def test_a_pulse_at_the_threshold_does_not_flutter() -> None:
         it.on_rc_channels(channels(pulse))
     assert told == [alert(AlertId.INJECTION_ON, by=RcChannel(9))]
     it.on_rc_channels(channels(1640))
-    assert not it.open
+    assert not it.enabled
 
 
 def test_the_newest_word_counts() -> None:
     it, _ = enable()
     assert it.command(COMMAND, 1.0) == mavlink.MAV_RESULT_ACCEPTED
     it.on_rc_channels(channels(1100))  # the first look at a switch that is off is no word
-    assert it.open
+    assert it.enabled
     it.on_rc_channels(channels(1900))
     assert it.command(COMMAND, 0.0) == mavlink.MAV_RESULT_ACCEPTED
     it.on_rc_channels(channels(1900))  # still on, not moved
-    assert not it.open
+    assert not it.enabled
     it.on_rc_channels(channels(1100))
     it.on_rc_channels(channels(1900))
-    assert it.open
+    assert it.enabled

@@ -393,7 +393,7 @@ def test_what_gps_input_told_the_receiver_is_no_word_for_vision(monkeypatch):
     flight.gnss_north_m = flight.ekf_north_m = 20.0
     flight.run(150.0)
     score = flight.end.shadow_score(flight.now_ns)
-    assert not score.go, score.line()
+    assert not score.ready, score.line()
     assert flight.end.on_gnss(flight.now_ns) is False
     enable.command(31010, 0.0)
     flight.run(1.0)
@@ -406,7 +406,7 @@ def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(monkeyp
     injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input", gps_id=1)
     flight = on_gnss(monkeypatch, mode="shadow", injection=injection)
     flight.run(20.0)
-    assert flight.end.shadow_score(flight.now_ns).go
+    assert flight.end.shadow_score(flight.now_ns).ready
     assert flight.end.on_gnss(flight.now_ns)
 
 

@@ -72,7 +72,7 @@ def scored(error_m: float, *, sigma: float = 0.5, hz: float = 10.0, seconds: flo
 
 def test_good_vision_is_a_go() -> None:
     score = scored(0.5)
-    assert score.go
+    assert score.ready
     assert score.samples == 100
     assert score.median_m == pytest.approx(0.5, abs=0.1)
     assert score.bias_ne_m == pytest.approx((0.5, 0.0), abs=0.1)
@@ -91,7 +91,7 @@ def test_good_vision_is_a_go() -> None:
 )
 def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason: AlertId) -> None:
     score = scored(**options)
-    assert not score.go
+    assert not score.ready
     assert reason in {r.id for r in score.reasons}
     assert score.line().startswith("not ready: ")
 
@@ -107,13 +107,13 @@ def test_a_wrong_geoid_is_seen_in_the_heights(altitude: float, go: bool) -> None
         scorer.compare(position(i * 100 * MS), (*HOME, altitude))
     score = scorer.score(10 * SECOND, None)
     assert score.height_m == pytest.approx(500.0 - altitude)
-    assert score.go is go
+    assert score.ready is go
     assert any(r.id is AlertId.SHADOW_HEIGHT for r in score.reasons) is not go
 
 
 def test_nothing_compared_is_a_no_go() -> None:
     score = ShadowScorer(100.0).score(SECOND, None)
-    assert not score.go
+    assert not score.ready
     assert score.median_m is score.height_m is score.rate_hz is None
     assert score.reasons == (alert(AlertId.SHADOW_NOT_COMPARED),)
 

@@ -84,11 +84,11 @@ def test_a_killed_process_leaves_the_gate_open(left_open: dict[str, Path], by: s
     path = left_open[by]
     assert path.stat().st_mode & 0o777 == 0o600
     enable, told = restarted(path)
-    assert enable.open
+    assert enable.enabled
     assert told == [alert(AlertId.INJECTION_RESTORED, seconds=pytest.approx(4.0, abs=0.6))]
     enable.on_rc_channels(LOW)
     # The switch was turned off meanwhile; a low channel says nothing against a command.
-    assert enable.open is (by == "command")
+    assert enable.enabled is (by == "command")
     enable.stop()
     assert not path.exists()  # an orderly end is not a restart in the air
 
@@ -134,7 +134,7 @@ def test_an_old_file_and_one_from_the_future_count_for_nothing(tmp_path, later_s
     path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
     path.chmod(0o600)
     enable, told = restarted(path, later_s)
-    assert not enable.open
+    assert not enable.enabled
     assert told == [alert(AlertId.INJECTION_OFF, by=InjectionOrder.START)]
     enable.stop()
 

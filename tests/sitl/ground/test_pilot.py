@@ -172,6 +172,11 @@ def test_a_missing_arducopter_is_a_named_error(monkeypatch, tmp_path):
     assert open_vehicle("auto", HOME).kind == "embedded"
 
 
+def test_px4_flies_on_the_embedded_vehicle(monkeypatch, tmp_path):
+    monkeypatch.setattr("sitl.vehicles.launch.find_arducopter", lambda: tmp_path)
+    assert open_vehicle("auto", HOME, VehicleSetup(px4=True)).kind == "embedded"
+
+
 def test_missing_default_parameters_are_a_named_error(monkeypatch, tmp_path):
     binary = tmp_path / "arducopter"
     binary.write_text("#!/bin/sh\n")

@@ -26,7 +26,6 @@ from sitl.suite.loop.evaluation import (
     LoopExpectationResult,
     LoopRecord,
     LoopSample,
-    LoopText,
     RestartTimes,
     evaluate,
     false_alarms,
@@ -35,6 +34,7 @@ from sitl.suite.loop.evaluation import (
 )
 from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
+from sitl.suite.record import Text
 
 GOOD = LoopSample(0.0, 0.3, 0.0, 0.0, "AUTO", "ok", "localization tracking", 0.5)
 
@@ -64,7 +64,7 @@ def overloaded(hertz: float) -> str:
 
 
 def record(samples: tuple[LoopSample, ...], errors: tuple[float, ...] = (0.2,)) -> LoopRecord:
-    return LoopRecord(samples, (LoopText(1.0, 191, 4, FROZEN),), errors)
+    return LoopRecord(samples, (Text(1.0, 191, 4, FROZEN),), errors)
 
 
 def test_every_expectation_can_fail() -> None:
@@ -94,7 +94,7 @@ def test_who_is_back_too_late_or_never_is_missed(injects_s: float, ok: bool) -> 
 @pytest.mark.parametrize(("degraded_s", "ok"), [(9.0, True), (4.0, False)])
 def test_the_warning_must_come_before_what_it_warns_of(degraded_s: float, ok: bool) -> None:
     dim, lost = alert(AlertId.LOW_CONTRAST, gray=1.8), alert(AlertId.LOST, seconds=1.0)
-    texts = (LoopText(degraded_s, 191, 3, text(lost)), LoopText(5.0, 191, 4, text(dim)))
+    texts = (Text(degraded_s, 191, 3, text(lost)), Text(5.0, 191, 4, text(dim)))
     expect = Expectation(warns_first=AlertId.LOW_CONTRAST)
     assert evaluate(LoopRecord(flight([0.5] * 4), texts, (0.2,)), expect)[-1].ok is ok
     assert not evaluate(record(flight([0.5] * 4)), expect)[-1].ok
@@ -107,7 +107,7 @@ def replace_says(expect: Expectation) -> Expectation:
 def test_texts_that_cycle_are_counted_figures_aside() -> None:
     """As on an overloaded machine: the same four texts, 42 times (an attack's flight)."""
     texts = tuple(
-        LoopText(float(at_s), component, 4, overloaded(float(at_s)))
+        Text(float(at_s), component, 4, overloaded(float(at_s)))
         for at_s, component in ((1, 191), (3, 191), (4, 1), (5, 191))
     )
     cycling = LoopRecord(flight([0.5] * 4), texts, (0.2,))
@@ -118,11 +118,11 @@ def test_texts_that_cycle_are_counted_figures_aside() -> None:
 
 
 def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
-    quiet = LoopRecord(flight([0.5] * 4), (LoopText(1.0, 1, 3, "EKF3 IMU0 yaw"),), (0.2,))
+    quiet = LoopRecord(flight([0.5] * 4), (Text(1.0, 1, 3, "EKF3 IMU0 yaw"),), (0.2,))
     assert false_alarms(quiet) == ()
     lost = replace(
         quiet,
-        texts=(LoopText(1.5, 191, 4, text(alert(AlertId.GNSS_LOST, output=Output.INJECTING))),),
+        texts=(Text(1.5, 191, 4, text(alert(AlertId.GNSS_LOST, output=Output.INJECTING))),),
     )
     assert false_alarms(lost, denied=True) == ()
     assert len(false_alarms(lost)) == 1

@@ -77,7 +77,7 @@ def test_a_bad_file_is_a_named_error(tmp_path: Path, changes: dict[str, str], na
     path = tmp_path / "bad.yaml"
     path.write_text(case_text(**changes))
     with pytest.raises(ScenarioError) as caught:
-        load_case(path)
+        load_case(path, Case)
     assert named in str(caught.value)
     assert "bad.yaml" in str(caught.value)
 
@@ -160,8 +160,8 @@ def test_an_untold_jump_must_be_refused_for_a_while_and_then_taken() -> None:
 def test_texts_are_looked_for_by_sender_and_time() -> None:
     flown = record()
     flown.texts += [
-        Text(5.0, "vehicle", "EKF Failsafe: changed to LAND Mode"),
-        Text(6.0, "bridge", statustext(alert(AlertId.POSITION_JUMP, metres=7.0))),
+        Text(5.0, 1, 3, "EKF Failsafe: changed to LAND Mode"),
+        Text(6.0, 191, 4, statustext(alert(AlertId.POSITION_JUMP, metres=7.0))),
     ]
     said = {"check": "text", "contains": "LAND"}
     assert expectation(**said).evaluate(flown).ok
@@ -240,8 +240,8 @@ def row(name: str, flown: CaseRecord | None, error: str = "") -> ReportRow:
 def test_the_report_holds_every_flight(tmp_path: Path) -> None:
     flown = record(0.20)
     flown.texts += [
-        Text(2.0, "bridge", statustext(alert(AlertId.POSITION_JUMP, metres=7.0))),
-        Text(3.0, "bridge", statustext(alert(AlertId.GNSS_LOST, output=Output.INJECTING))),
+        Text(2.0, 191, 4, statustext(alert(AlertId.POSITION_JUMP, metres=7.0))),
+        Text(3.0, 191, 4, statustext(alert(AlertId.GNSS_LOST, output=Output.INJECTING))),
     ]
     rows = [
         row("vpe", flown),

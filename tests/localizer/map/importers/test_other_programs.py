@@ -303,6 +303,17 @@ def test_a_colour_without_a_picture_is_that_colour(make, material, linear):
     assert mesh.image.reshape(-1, 3) == pytest.approx(np.tile(encoded, (16, 1)), abs=1)
 
 
+def test_a_strip_faces_up_as_its_triangles_do(make):
+    """Of a strip every second triangle has its corners in reverse (glTF 2.0, 3.7.2.1)."""
+    ground = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 2, 0], [1, 2, 0]])
+    strip = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "mode": 5}
+    data = make.glb(
+        ground, ground[:, :2], np.arange(6), make.picture(3), meshes=[{"primitives": [strip]}]
+    )
+    (mesh,), _ = read_gltf(data, lambda uri: b"")
+    assert vector_area(mesh.positions, mesh.faces) == pytest.approx([0, 0, 2])
+
+
 def holed(alpha):
     image = np.full((128, 128, 4), 255, np.uint8)
     image[..., :3] = np.random.default_rng(1).integers(0, 255, (128, 128, 3))

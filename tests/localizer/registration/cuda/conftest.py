@@ -59,9 +59,9 @@ def build(source: Path, *options: str, reads: tuple[Path, ...] = ()) -> Path:
     return library
 
 
-def emulated_kernels(channels: int, half: bool, architecture: tuple[int, int]) -> Image:
+def emulated_kernels(channels: int, architecture: tuple[int, int]) -> Image:
     """In place of `compile_kernels`."""
-    options = [f"-D{name}={value}" for name, value in macros(channels, half).items()]
+    options = [f"-D{name}={value}" for name, value in macros(channels).items()]
     kernels = f'-DKERNEL_SOURCE="{SOURCES / "jngo.cu"}"'
     return Image(f"emulated:{build(EMULATION / 'kernels.cpp', kernels, *options)}".encode(), "")
 
@@ -163,7 +163,7 @@ def real_device() -> Device:
 
 @pytest.fixture(params=["emulated", pytest.param("real", marks=pytest.mark.gpu)])
 def make_backend(request: pytest.FixtureRequest) -> Iterator[Callable[..., CudaBackend]]:
-    """Makes backends on either device: ``make_backend(half=True)``; they are closed afterwards."""
+    """Makes backends on either device: ``make_backend()``; they are closed afterwards."""
     made: list[CudaBackend] = []
     real = request.param == "real"
     device = request.getfixturevalue("real_device" if real else "emulator")
@@ -171,8 +171,8 @@ def make_backend(request: pytest.FixtureRequest) -> Iterator[Callable[..., CudaB
         device = device.device
     compile_ = compile_kernels if real else emulated_kernels
 
-    def make(half: bool = False) -> CudaBackend:
-        made.append(CudaBackend(device, half=half, compile=compile_))
+    def make() -> CudaBackend:
+        made.append(CudaBackend(device, compile=compile_))
         return made[-1]
 
     yield make

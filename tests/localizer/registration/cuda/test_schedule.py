@@ -25,8 +25,8 @@ CONFIG = JNGOConfig(hypotheses=16, survivors=(6, 3), swarm_anchors=(100, 150, 15
 
 @pytest.fixture
 def registered(make_backend):
-    """``registered(config, half)``: `JNGO.register` on the device."""
-    return lambda config=CONFIG, half=False: JNGO(config, make_backend(half)).register
+    """``registered(config)``: `JNGO.register` on the device."""
+    return lambda config=CONFIG: JNGO(config, make_backend()).register
 
 
 def check(device, cpu, metres=3e-3, degrees=3e-3, rtol=0.02):
@@ -122,15 +122,6 @@ def test_agrees_on_a_detail_level(registered, place, scene, prior, constrained):
     check(registered()(*arguments, constraint=known), expected)
 
 
-def test_float16_features_find_the_same_place(registered, scene, prior):
-    arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.5))
-    found, exact = registered(half=True)(*arguments), JNGO(CONFIG).register(*arguments)
-    distance, angle = found.world_from_camera.distance_to(exact.world_from_camera)
-    assert distance < 0.02
-    assert angle < 0.01
-    np.testing.assert_allclose(found.covariance, exact.covariance, rtol=0.1, atol=1e-6)
-
-
 def failed(result, about, status):
     assert result.status is status
     assert result.world_from_camera is about.world_from_camera
@@ -152,8 +143,7 @@ def changed(query: FeaturePyramid, level: int, **changes) -> FeaturePyramid:
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered in matmul")  # of the infinite point
 @pytest.mark.parametrize("kind", ["features", "confidence", "anchors", "points"])
-@pytest.mark.parametrize("half", [False, True])
-def test_one_value_that_is_not_finite_is_seen(registered, scene, prior, kind, half):
+def test_one_value_that_is_not_finite_is_seen(registered, scene, prior, kind):
     about, query, anchors = prior(scene.reference, 1.0, 1.0), scene.query, scene.anchors
     if kind in ("features", "confidence"):
         values = getattr(query.levels[2], kind).copy()
@@ -167,7 +157,7 @@ def test_one_value_that_is_not_finite_is_seen(registered, scene, prior, kind, ha
         points = anchors.points_world.copy()
         points[7, 2] = np.inf
         anchors = replace(anchors, points_world=points)
-    result = registered(half=half)(query, scene.camera, anchors, about)
+    result = registered()(query, scene.camera, anchors, about)
     failed(result, about, RegistrationStatus.BAD_FEATURES)
 
 

@@ -48,20 +48,6 @@ inline int max(int a, int b) { return a > b ? a : b; }
 template <class T> inline T __ldg(const T* from) { return *from; }
 inline int atomicAdd(int* to, int value) { int old = *to; *to += value; return old; }
 
-inline float half_value(unsigned bits) {
-    const unsigned sign = (bits & 0x8000u) << 16, exponent = bits >> 10 & 31u, mantissa = bits & 1023u;
-    if (exponent == 0) {
-        const float value = std::ldexp((float)mantissa, -24);
-        return sign ? -value : value;
-    }
-    if (exponent == 31) return bits_as<float>(sign | 0x7f800000u | mantissa << 13);
-    return bits_as<float>(sign | (exponent + 112u) << 23 | mantissa << 13);
-}
-inline void half_pair(unsigned bits, float& low, float& high) {
-    low = half_value(bits & 0xffffu);
-    high = half_value(bits >> 16);
-}
-
 namespace emulation {
 
 constexpr int kWarp = 32;
