@@ -220,8 +220,8 @@ class BlockScores:
     """Scores (step, step) of one trial (heading and height) at the origins of each block that suits
     its height.
 
-    noise: root mean square of the trial's scores. Trials are compared by score divided by noise:
-    low above a hill few cells are seen, and some position always looks similar.
+    noise: root mean square of the trial's scores over ground. Trials are compared by score divided
+    by noise: low above a hill few cells are seen, and some position always looks similar.
     """
 
     trial: Rectification
@@ -230,9 +230,19 @@ class BlockScores:
 
 
 @dataclass(frozen=True)
+class SuitedOrigins:
+    """A block's origins for one height. mask: those that it suits, every `GROUND_CELLS`; known:
+    share of them all that is over ground.
+    """
+
+    mask: NDArray[np.bool_]
+    known: float
+
+
+@dataclass(frozen=True)
 class _MapSearch:
-    """Data of one search. blocks: of the map; suited: for each height, the blocks that it suits,
-    and masks (`suits`).
+    """Data of one search. blocks: of the map; suited: for each height, the blocks with an origin
+    that it suits.
     """
 
     view: SearchView
@@ -243,7 +253,7 @@ class _MapSearch:
     seen: CameraFootprint
     heights: Array
     blocks: tuple[Block, ...]
-    suited: tuple[dict[Block, NDArray[np.bool_]], ...] = ()
+    suited: tuple[dict[Block, SuitedOrigins], ...] = ()
 
     @property
     def lead(self) -> int:
@@ -264,7 +274,7 @@ class _MapSearch:
             for scale in group:
                 trial = self.trial(float(heading), float(self.heights[scale]))
                 suited = self.suited[scale].items()
-                if blocks := {b: where for b, where in suited if self.meets(b, trial)}:
+                if blocks := {b: origins for b, origins in suited if self.meets(b, trial)}:
                     wanted.append((trial, blocks))
         if not wanted:
             return []
@@ -286,7 +296,7 @@ class _MapSearch:
     def correlate(
         self,
         patches: list[PatchSpectra],
-        wanted: list[tuple[Rectification, dict[Block, NDArray[np.bool_]]]],
+        wanted: list[tuple[Rectification, dict[Block, SuitedOrigins]]],
         should_stop: Callable[[], bool],
     ) -> list[BlockScores] | None:
         """Correlate patches (at most `PATCHES_TOGETHER`), each with its own blocks."""
@@ -303,10 +313,11 @@ class _MapSearch:
             ):
                 trial, blocks = wanted[n]
                 power[n] += float(np.vdot(raw, raw)) / raw.size
-                scores[n].append((block, self.masked(raw, block, trial, blocks[block])))
+                scores[n].append((block, self.masked(raw, block, trial, blocks[block].mask)))
+        known = [sum(origins.known for origins in blocks.values()) for _, blocks in wanted]
         return [
-            BlockScores(trial, max(math.sqrt(power[n] / len(blocks)), 1e-6), scores[n])
-            for n, (trial, blocks) in enumerate(wanted)
+            BlockScores(trial, max(math.sqrt(power[n] / known[n]), 1e-6), scores[n])
+            for n, (trial, _) in enumerate(wanted)
         ]
 
     def trial(self, heading: float, height: float) -> Rectification:
@@ -347,13 +358,15 @@ class _MapSearch:
         last = self.camera_at(np.array([block.row, block.column + block.step]), trial)
         return not ((first > high).any() or (last < low).any())
 
-    def suited_at(self, scale: int) -> dict[Block, NDArray[np.bool_]]:
-        """The blocks with an origin that suits the scale's height, at any heading, and the mask of
-        these origins, every `GROUND_CELLS`.
-        """
+    def suited_at(self, scale: int) -> dict[Block, SuitedOrigins]:
+        """The blocks with an origin that suits the scale's height, at any heading."""
         cells = self.cells(float(self.heights[scale]))
-        where = {b: self.suits(self.ground(b, cells), scale) for b in self.blocks}
-        return {b: suits for b, suits in where.items() if suits.any()}
+        ground = {b: self.ground(b, cells) for b in self.blocks}
+        origins = {
+            b: SuitedOrigins(self.suits(below, scale), float(np.isfinite(below).mean()))
+            for b, below in ground.items()
+        }
+        return {b: o for b, o in origins.items() if o.mask.any()}
 
     def ground(self, block: Block, cells: int) -> Float32:
         """Ground heights below the centres of patches of this many cells, every `GROUND_CELLS`."""
