@@ -16,10 +16,12 @@ from localizer.relocalization.align import FrameShift, displacement
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
-from localizer.relocalization.patch import footprint, rectify, with_heading
+from localizer.relocalization.patch import CameraFootprint, footprint, rectify, with_heading
 from localizer.relocalization.search import (
     Rectification,
+    SearchView,
     _fitted,
+    _MapSearch,
     above_roofs,
     ground_of,
     trial_heights,
@@ -142,6 +144,26 @@ def test_a_patch_of_which_nothing_is_seen_looks_like_no_place():
     unseen = transform_patch(np.zeros((16, 16, 3), np.float32), np.zeros((16, 16), np.float32))
     for block in correlator.blocks(16):
         assert np.abs(correlator.correlate(unseen, block)).max() == 0
+
+
+def test_a_trials_noise_is_that_of_the_ground_it_was_compared_with():
+    """Where most of a block is beyond the map, it was low, and such scores outranked others."""
+    whole = level(smooth(8, 512))
+    strip = replace(whole, features=whole.features.copy(), ground=whole.ground.copy())
+    strip.features[:, :, 96:], strip.ground[:, 6:] = 0, np.nan
+    patch = transform_patch(smooth(9, 24).transpose(1, 2, 0) * 0.01, np.ones((24, 24), np.float32))
+
+    def noise(overview):
+        correlator, view = LevelCorrelator(overview, 0), SearchView(query().frame.image, CAMERA)
+        run = _MapSearch(
+            view, query(), correlator, None, CONFIG, CameraFootprint(np.zeros(2), 0.48),
+            np.array([100.0]), tuple(correlator.blocks(24)),
+        )  # fmt: skip
+        wanted = [(run.trial(0.0, 100.0), run.suited_at(0))]
+        (found,) = run.correlate([patch], wanted, lambda: False)
+        return found.noise
+
+    assert noise(strip) == pytest.approx(noise(whole), rel=0.15)
 
 
 def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
