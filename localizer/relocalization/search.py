@@ -46,8 +46,7 @@ _MOST_PX = MOST_CELLS * STRIDE  # of a patch's side
 _UNSEEN_PX = 9  # next to what is not seen, features are of the filling
 _SUPPRESSED_M = 12.0  # about a candidate, whose neighbours are no other place
 _LEAST_HEIGHT_M = 10.0
-# Features of a patch turned by 3 degrees are those of the turned patch (correlation 0.98).
-_HEADINGS_TOGETHER = 2
+_HEADINGS_TOGETHER = 3  # that share an extraction: its features are turned by up to 6 degrees
 
 
 @dataclass(frozen=True)

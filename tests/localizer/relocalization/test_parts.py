@@ -79,11 +79,11 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
 
 
 def test_scores_are_normalised_correlations():
-    rng = np.random.default_rng(0)
     features = smooth(0, 288)
     n = 24
-    mask = (rng.random((n, n)) > 0.2).astype(np.float32)
-    patch = rng.normal(size=(n, n, 3)).astype(np.float32) * mask[..., None]
+    mask = np.ones((n, n), np.float32)
+    mask[:9, :14] = 0
+    patch = smooth(1, n).transpose(1, 2, 0) * mask[..., None]
     correlator = LevelCorrelator(level(features), 1 << 26)
     spectra = transform_patch(patch, mask)
     checked = 0
@@ -97,7 +97,8 @@ def test_scores_are_normalised_correlations():
             energy = ((window**2).sum(-1) * mask).sum()
             expected = (window * patch).sum() / np.sqrt(energy * (patch**2).sum())
             # The energy under the patch is summed over 8 cells and interpolated: a few per cent.
-            assert scores[i, j] == pytest.approx(expected, rel=0.1, abs=0.003)
+            # The patch's high frequencies, of its edges, are folded in: a few per cent of a score.
+            assert scores[i, j] == pytest.approx(expected, rel=0.1, abs=0.02)
             checked += 1
     assert checked >= 6
 
