@@ -64,7 +64,10 @@ class OpenVinoSession:
         found = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
         for name, array in found.items():  # the network writes into them: no copy
             request.set_tensor(name, self._openvino.Tensor(array, shared_memory=True))
-        request.infer(inputs, share_inputs=True, share_outputs=True)
+        image = np.require(image, requirements="W")  # what OpenVINO shares
+        request.set_input_tensor(self._openvino.Tensor(image, shared_memory=True))
+        request.start_async()  # `infer` spends 0.2 ms on dictionaries of tensors
+        request.wait()
         return [found[name] for name in outputs]
 
     def _request(self, shape: tuple[int, ...]) -> tuple[Any, dict[str, tuple[int, ...]]]:
