@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.types import FeatureLevel, FeaturePyramid, Image
@@ -55,14 +56,30 @@ def detail_level(rgb: Image) -> FeatureLevel:
     The vectors do not have unit length. The fourth channel is zero, so that a pixel fills one SIMD
     register of four floats.
     """
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) * np.float32(1 / 255)
     smooth = cv2.GaussianBlur(gray, (0, 0), _SMOOTH_PX)
     mean = cv2.GaussianBlur(smooth, (0, 0), _CONTRAST_PX)
-    variance = cv2.GaussianBlur(smooth * smooth, (0, 0), _CONTRAST_PX) - mean * mean
-    contrast = np.sqrt(np.maximum(variance, 0.0)) + np.float32(_CONTRAST_FLOOR)
-    features = np.zeros((*gray.shape, 4), np.float32)
-    features[..., 0] = np.float32(_BRIGHTNESS_SHARE) * (smooth - mean) / contrast
-    features[..., 1] = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8) / contrast
-    features[..., 2] = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8) / contrast
-    confidence = contrast / (contrast + np.float32(_CONFIDENT_CONTRAST))
-    return FeatureLevel(features, confidence, 1)
+    squares = cv2.GaussianBlur(smooth * smooth, (0, 0), _CONTRAST_PX)
+    dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
+    dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
+    features = np.empty(4 * gray.size, np.float32)
+    confidence = np.empty(gray.size, np.float32)
+    planes = (plane.reshape(-1) for plane in (smooth, mean, squares, dx, dy))
+    _normalise(*planes, features, confidence)
+    return FeatureLevel(features.reshape(*gray.shape, 4), confidence.reshape(gray.shape), 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normalise(smooth, mean, squares, dx, dy, features, confidence):  # type: ignore[no-untyped-def]
+    """Brightness and derivatives, divided by the local contrast, and the confidence."""
+    floor, half = np.float32(_CONTRAST_FLOOR), np.float32(_CONFIDENT_CONTRAST)
+    share, zero = np.float32(_BRIGHTNESS_SHARE), np.float32(0)
+    contrast = squares
+    for k in range(len(smooth)):  # two loops: with more arrays in one, LLVM makes no SIMD
+        contrast[k] = np.sqrt(max(squares[k] - mean[k] * mean[k], zero)) + floor
+        confidence[k] = contrast[k] / (contrast[k] + half)
+    for k in range(len(smooth)):
+        features[4 * k] = share * (smooth[k] - mean[k]) / contrast[k]
+        features[4 * k + 1] = dx[k] / contrast[k]
+        features[4 * k + 2] = dy[k] / contrast[k]
+        features[4 * k + 3] = zero

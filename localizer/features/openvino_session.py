@@ -36,14 +36,14 @@ class OpenVinoSession:
     threads may call `run`. threads: number used by one call.
     """
 
-    def __init__(self, model: Path, threads: int) -> None:
+    def __init__(self, graph: bytes, threads: int) -> None:
         import openvino
 
         self._openvino: Any = openvino
         self._core = openvino.Core()
-        self._model, self._threads = model, threads
+        self._graph, self._threads = graph, threads
         self._outputs = [
-            _Output(output.get_any_name()) for output in self._core.read_model(model).outputs
+            _Output(output.get_any_name()) for output in self._core.read_model(graph).outputs
         ]
         self._compiled: OrderedDict[tuple[int, ...], Any] = OrderedDict()
         self._lock = threading.Lock()
@@ -64,7 +64,10 @@ class OpenVinoSession:
         found = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
         for name, array in found.items():  # the network writes into them: no copy
             request.set_tensor(name, self._openvino.Tensor(array, shared_memory=True))
-        request.infer(inputs, share_inputs=True, share_outputs=True)
+        image = np.require(image, requirements="W")  # what OpenVINO shares
+        request.set_input_tensor(self._openvino.Tensor(image, shared_memory=True))
+        request.start_async()  # `infer` spends 0.2 ms on dictionaries of tensors
+        request.wait()
         return [found[name] for name in outputs]
 
     def _request(self, shape: tuple[int, ...]) -> tuple[Any, dict[str, tuple[int, ...]]]:
@@ -86,7 +89,7 @@ class OpenVinoSession:
         return network
 
     def _compile(self, shape: tuple[int, ...]) -> Any:
-        model = self._core.read_model(self._model)
+        model = self._core.read_model(self._graph)
         model.reshape(shape)
         settings = {
             "INFERENCE_PRECISION_HINT": "bf16",

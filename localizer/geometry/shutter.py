@@ -60,6 +60,7 @@ class Sweep:
     @staticmethod
     def _share(away: Array, world_from_camera: Pose, camera: Camera) -> Array:
         """(N, 1) readout time of each point's row: -0.5 for the first to 0.5 for the last."""
-        pixels, _ = camera.project(away @ world_from_camera.rotation)
-        rows = np.nan_to_num(pixels[:, 1] / camera.height - 0.5)
-        return np.clip(rows, -0.5, 0.5)[:, None]
+        x, y, z = world_from_camera.rotation.T @ away.T
+        z = np.where(z > 1e-6, z, np.nan)  # behind the camera: the middle row
+        rows = (camera.fy * camera.distorted(x / z, y / z)[1] + camera.cy) / camera.height - 0.5
+        return np.clip(np.nan_to_num(rows), -0.5, 0.5)[:, None]

@@ -73,6 +73,7 @@ class VisualOdometry:
         self.config = config or OdometryConfig()
         self._ground = self._terrain = ground
         self._plane: TerrainModel | None = None
+        self._surface: Array | None = None  # that the plane lies under
         self._last_seen = np.zeros(3)  # the middle of the map's surfaces that the plane lies under
         self._sounded = RangefinderGround()
         self._seed = seed
@@ -111,7 +112,9 @@ class VisualOdometry:
         self._track = OdometryTrack(
             pose, covariance, speed, frame.time_ns, 0.0, aided, corrected, np.zeros((6, 6))
         )
-        if surface is not None and len(surface) > self._optimizer.config.min_anchors:
+        least = self._optimizer.config.min_anchors
+        if surface is not None and surface is not self._surface and len(surface) > least:
+            self._surface = surface
             self._plane, self._last_seen = FlatGround.under(surface), surface.mean(axis=0)
             if self._terrain is not None:
                 self._ground = RaisedGround.onto(self._terrain, surface)

@@ -109,10 +109,10 @@ def _stratified(cell: NDArray[np.int64], count: int, rng: np.random.Generator) -
 
 def morton_code(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
     """Z-order code: the bits of x and y interleaved."""
-    code = np.zeros(len(x), dtype=np.int64)
-    for bit in range(16):
-        code |= ((x >> bit) & 1) << (2 * bit) | ((y >> bit) & 1) << (2 * bit + 1)
-    return code
+    code = y << 32 | x  # both of 16 bits
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        code = (code | code << shift) & (mask << 32 | mask)
+    return code & 0xFFFFFFFF | code >> 31
 
 
 def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:

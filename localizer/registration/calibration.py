@@ -105,7 +105,7 @@ def _pixel_motion(points: Array, pose: Pose, camera: Camera) -> Array:
     by_point = np.zeros((len(points), 2, 3))
     by_point[:, 0, 0], by_point[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
     by_point[:, 1, 1], by_point[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-    in_world = by_point @ R.T
+    in_world = (by_point.reshape(-1, 3) @ R.T).reshape(-1, 2, 3)
     (a, b, c), (p, q, r) = np.moveaxis(in_world, 2, 0), away.T[:, :, None]
     # row' (away x turn) = (row x away)' turn; np.cross costs several times as much
     turned = np.stack([b * r - c * q, c * p - a * r, a * q - b * p], axis=2)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from localizer.geometry.pose import Array, Pose
-from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
+from localizer.registration.backend import LevelProblem, LMSettings
 from localizer.registration.cpu.reference import (
-    feature_gradients,
     in_view,
     pose_tangent_map,
     prior_terms,
@@ -19,6 +18,7 @@ from localizer.registration.cpu.reference import (
     projection_jacobian,
     robust_loss,
 )
+from localizer.registration.sampling import sample_map, structure_tensors
 
 _LEAST_CURVATURE = 0.03
 
@@ -56,25 +56,22 @@ def anchor_model(
     x, uv = project(problem, rotation, translation)
     visible = in_view(problem, x, uv)
     x, (u, v) = x[visible], uv[visible].T
-    residuals = (sample_bilinear(problem.features, u, v) - problem.anchor_features[visible]).astype(
-        np.float32
-    )
-    gradient = np.stack(feature_gradients(problem.features, u, v), axis=1).astype(np.float32)
-    squares = np.einsum("nc,nc->n", residuals, residuals)
-    confidence = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
+    anchors = problem.anchor_features[visible]
+    structure, slope, squares = structure_tensors(problem.features, anchors, u, v)
+    confidence = problem.anchor_confidence[visible] * sample_map(problem.confidence, u, v)
     prior_hessian = np.zeros((6, 6))
     if problem.prior is not None:
         _, prior_hessian, _ = prior_terms(problem.prior, rotation, translation)
     return AnchorModel(
         projection_jacobian(problem, x, translation),
-        (gradient @ gradient.transpose(0, 2, 1)).astype(np.float64),
-        (gradient @ residuals[:, :, None])[:, :, 0].astype(np.float64),
+        structure,
+        slope,
         squares,
         confidence,
         robust_loss(np.sqrt(squares), settings)[1],
         _cells(u, v, cell_px),
         cell_px,
-        residuals.shape[1],
+        anchors.shape[1],
         prior_hessian,
     )
 
@@ -113,18 +110,20 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
     total = model.weights.sum()
     if not total > 0:
         return None
-    J = model.projection
+    J, S = model.projection, model.structure
     share = (scale / total)[:, None, None]
-    information = J.transpose(0, 2, 1) @ (share * model.structure) @ J
-    per_anchor = (J.transpose(0, 2, 1) @ (share * model.slope[:, :, None]))[:, :, 0]
+    rows = J.reshape(-1, 6)  # whole matrices: of each anchor's small ones NumPy makes a call each
+    information = share * (S[:, :, :1] * J[:, :1] + S[:, :, 1:] * J[:, 1:])
+    pull = share * model.slope[:, :, None]
+    per_anchor = pull[:, 0] * J[:, 0] + pull[:, 1] * J[:, 1]
     cells = int(model.cell.max()) + 1
     per_cell = np.zeros((cells, 6))
     np.add.at(per_cell, model.cell, per_anchor)
     variance = scale @ model.squares / max(scale.sum(), 1e-12) / model.channels
     return CovarianceSums(
-        information.sum(axis=0),
+        rows.T @ information.reshape(-1, 6),
         per_cell.T @ per_cell,
-        variance * (share * information).sum(axis=0),
+        variance * (rows.T @ (share * information).reshape(-1, 6)),
         cells,
         model.cell_px,
         model.prior_hessian,
@@ -135,7 +134,8 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
 
 def mean_motion(projection: Array) -> Array:
     """Mean of JᵀJ (6, 6) of the rows (N, 2, 6) of equation 6, in px²."""
-    motion: Array = np.einsum("nai,naj->ij", projection, projection) / max(len(projection), 1)
+    rows = projection.reshape(-1, 6)
+    motion: Array = rows.T @ rows / max(len(projection), 1)
     return motion
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
@@ -66,14 +68,16 @@ def _grid(half: Array, step: float, count: int) -> Array:
     """At most `count` points (M, 2), nearest first, of a grid over +-half per axis."""
     most = max(1, int(np.sqrt(count)))
     least = min(_LEAST_TICKS, most)
-    ticks = [
-        np.linspace(-h, h, n) if n > 1 else np.zeros(1)
-        for h, n in zip(
-            half, np.clip(np.ceil(2 * half / step - 1e-9) + 1, least, most).astype(int), strict=True
-        )
-    ]
+    counts = np.clip(np.ceil(2 * half / step - 1e-9) + 1, least, most).astype(int)
+    return _unit_grid(*counts) * half
+
+
+@lru_cache(64)
+def _unit_grid(*counts: int) -> Array:
+    """Points (M, 2), nearest first, of a grid over +-1 per axis."""
+    ticks = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in counts]
     points = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 2)
-    distance = np.round(np.linalg.norm(points / np.maximum(half, 1e-12), axis=1), 9)
+    distance = np.round(np.linalg.norm(points, axis=1), 9)
     nearest: Array = points[np.argsort(distance, kind="stable")]
     return nearest
 

@@ -38,7 +38,7 @@ from localizer.registration.covariance import (
     pose_differences,
 )
 from localizer.registration.cpu.kernel import NumbaBackend
-from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
+from localizer.registration.cpu.reference import ReferenceBackend, retractions
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.registration import CudaRegistration
 from localizer.registration.devices import warm_up
@@ -286,12 +286,13 @@ class JNGO:
         steps = curvature_steps(sums.motion, self.config.curvature_px)
         rotations, translations = retractions(R, t, steps)
         free = replace(winner.problem, prior=None)
-        scores = self.backend.refine(free, rotations, translations, 0, settings).scores
+        found = self.backend.refine(free, rotations, translations, 0, settings)
+        count = winner.problem.points.shape[1]
         return replace(
             sums,
-            anchors=count_in_view(winner.problem, R, t),
-            share=few.points.shape[1] / winner.problem.points.shape[1],
-            curvature=curvature_ratio(scores, steps, sums.hessian),
+            anchors=round(float(found.overlaps[0]) * count),  # the first step is none
+            share=few.points.shape[1] / count,
+            curvature=curvature_ratio(found.scores, steps, sums.hessian),
         )
 
     def warm_up(self, channels: int) -> None:
@@ -425,5 +426,5 @@ def _all_finite(query: FeaturePyramid, anchors: Anchors) -> bool:
     ]
     for level in query.levels:
         arrays += [level.features, level.confidence]
-    # A sum is not finite when any term is not, and costs a tenth of isfinite().all().
-    return all(bool(np.isfinite(a.sum(dtype=np.float32))) for a in arrays)
+    # A sum of squares is not finite when any term is not, and costs little.
+    return all(bool(np.isfinite(np.vdot(a, a))) for a in arrays)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
-from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
+from localizer.registration.backend import LevelProblem, LMSettings
 from localizer.registration.cpu.reference import in_view, project, robust_loss
-from localizer.registration.sampling import sample_features
+from localizer.registration.sampling import sample_features, sample_map
 from localizer.types import Float32
 
 LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit perfectly
@@ -77,7 +77,7 @@ def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float3
     x, uv = project(problem, R, t)
     visible = in_view(problem, x, uv)
     u, v = uv[visible].T
-    weights = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
+    weights = problem.anchor_confidence[visible] * sample_map(problem.confidence, u, v)
     return sample_features(problem.features, u, v), problem.anchor_features[visible], weights
 
 

@@ -18,6 +18,8 @@ def fill_holes(view: RenderedView) -> Image:
     1996, section 3.4.3). Without any surface in view the image is unchanged.
     """
     known = view.depth > 0
+    if known.all():
+        return view.rgb
     holes = ~known & ~_above_horizon(view)
     if not holes.any() or not known.any():
         return view.rgb

@@ -248,4 +248,5 @@ def _process_noise(dt: float, config: MotionConfig) -> Array:
     """Discrete white-noise acceleration, (12, 12) (Bar-Shalom, Estimation, 6.3.2)."""
     sigmas = np.repeat([config.acceleration_sigma, config.angular_acceleration_sigma], 3)
     by_derivative = np.array([[0.25 * dt**4, 0.5 * dt**3], [0.5 * dt**3, dt**2]])
-    return np.kron(by_derivative, np.diag(sigmas**2))
+    noise: Array = by_derivative[:, None, :, None] * np.diag(sigmas**2)[None, :, None, :]
+    return noise.reshape(12, 12)

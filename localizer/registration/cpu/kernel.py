@@ -214,24 +214,54 @@ def _sample(C, n, w, features, anchor_features, buf, index):  # type: ignore[no-
 
 
 @njit(forceinline=True, **JIT)
+def _residuals(C, n, w, features, anchor_features, buf, index):  # type: ignore[no-untyped-def]
+    """Row 15 of `_sample` alone: all that a score needs."""
+    ka, kb, ke = buf[8], buf[9], buf[15]
+    anchor, cell = index[0], index[1]
+    row = w * C
+    for k in range(n):
+        ahead = cell[min(k + _AHEAD, n - 1)] * C
+        for c in range(0, 2 * C, _LINE):
+            prefetch(features, ahead + c)
+            prefetch(features, ahead + row + c)
+        a, b = ka[k], kb[k]
+        i, j = cell[k] * C, anchor[k] * C
+        f00, f01 = features[i : i + C], features[i + C : i + 2 * C]
+        f10 = features[i + row : i + row + C]
+        f11 = features[i + row + C : i + row + 2 * C]
+        fr = anchor_features[j : j + C]
+        e = _F(0)
+        for c in range(C):
+            top = f00[c] + a * (f01[c] - f00[c])
+            low = f10[c] + a * (f11[c] - f10[c])
+            r = top + b * (low - top) - fr[c]
+            e += r * r
+        ke[k] = e
+
+
+@njit(forceinline=True, **JIT)
 def _evaluate(  # type: ignore[no-untyped-def]
     C, R, t, focal, centre, points, features, confidence, anchor_features, anchor_confidence,
     h, w, delta, redescending, min_visible, prior_R, prior_t, information, prior_weight,
-    buf, index, work, sums,
+    derive, buf, index, work, sums,
 ):  # fmt: skip
-    """Score of a pose and the count of anchors in view; sums gets H and g."""
+    """Score of a pose and the count of anchors in view; sums gets H and g if `derive`."""
     _project(R, t, points, focal, centre, buf)
     n = _compact(points.shape[1], h, w, buf, index)
     if n < min_visible:
         return np.inf, n
-    _sample(C, n, w, features, anchor_features, buf, index)
+    if derive:
+        _sample(C, n, w, features, anchor_features, buf, index)
+    else:
+        _residuals(C, n, w, features, anchor_features, buf, index)
     cost, total = _weigh(n, w, confidence, anchor_confidence, _F(delta), redescending, buf, index)
     if not total > _F(0):
         return np.inf, n
-    _accumulate(n, t, focal, buf, sums)
     inverse = 1.0 / total
-    for i in range(27):
-        sums[i] *= inverse
+    if derive:
+        _accumulate(n, t, focal, buf, sums)
+        for i in range(27):
+            sums[i] *= inverse
     score = cost * inverse
     if prior_weight > 0.0:
         score += add_prior(R, t, prior_R, prior_t, information, prior_weight, sums, work)
@@ -270,7 +300,7 @@ def refine_kernel(channels: int) -> Callable[..., int]:
                 score, n = _evaluate(
                     C, R_try, t_try, focal, centre, points, features, confidence, anchor_features,
                     anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
-                    information, prior_weight, buf, index, work, sums,
+                    information, prior_weight, k < iterations, buf, index, work, sums,
                 )  # fmt: skip
                 evaluations += 1
                 if k == 0:

@@ -80,17 +80,11 @@ def projection_jacobian(problem: LevelProblem, x: Array, translation: Array) -> 
     """d(u, v) / d(rho, phi), (N, 2, 6): equation 6, rotation about the local origin."""
     fx, fy = problem.focal
     z = np.maximum(x[:, 2], MIN_DEPTH)
-    du = np.zeros((len(x), 2, 3))
-    du[:, 0, 0], du[:, 0, 2] = fx / z, -fx * x[:, 0] / z**2
-    du[:, 1, 1], du[:, 1, 2] = fy / z, -fy * x[:, 1] / z**2
-    arm = x - translation
-    dx = np.zeros((len(x), 3, 6))
-    dx[:, :, :3] = np.eye(3)
-    dx[:, 0, 4], dx[:, 0, 5] = arm[:, 2], -arm[:, 1]  # columns 3 to 5 are -hat(arm)
-    dx[:, 1, 3], dx[:, 1, 5] = -arm[:, 2], arm[:, 0]
-    dx[:, 2, 3], dx[:, 2, 4] = arm[:, 1], -arm[:, 0]
-    jacobian: Array = du @ dx
-    return jacobian
+    a, b, c, d = fx / z, -fx * x[:, 0] / z**2, fy / z, -fy * x[:, 1] / z**2
+    p, q, r = (x - translation).T
+    none = np.zeros(len(x))
+    columns = [a, none, b, b * q, a * r - b * p, -a * q, none, c, d, d * q - c * r, -d * p, c * p]
+    return np.stack(columns, axis=1).reshape(-1, 2, 6)
 
 
 def linearize(

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from localizer.registration import select_anchors
+from localizer.registration.anchors import morton_code
 from localizer.registration.backend import sample_bilinear
-from localizer.registration.sampling import sample_features
+from localizer.registration.cpu.reference import feature_gradients
+from localizer.registration.sampling import sample_features, structure_tensors
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +71,30 @@ def test_compiled_sampling_is_the_references(reference):
     x, y = rng.uniform(-3, 40, 500), rng.uniform(-3, 40, 500)
     exact = sample_bilinear(level.features, x, y)
     np.testing.assert_allclose(sample_features(level.features, x, y), exact, atol=1e-6)
+
+
+def test_compiled_structure_is_the_references(reference):
+    rng = np.random.default_rng(0)
+    level = reference[1].levels[1]
+    h, w, channels = level.features.shape
+    x, y = rng.uniform(0, w - 1.01, 200), rng.uniform(0, h - 1.01, 200)
+    anchors = rng.normal(size=(200, channels)).astype(np.float32)
+    gradient = np.stack(feature_gradients(level.features, x, y), axis=1)
+    residual = sample_bilinear(level.features, x, y) - anchors
+    tensors, slopes, squares = structure_tensors(level.features, anchors, x, y)
+    np.testing.assert_allclose(tensors, gradient @ gradient.transpose(0, 2, 1), atol=1e-5)
+    np.testing.assert_allclose(slopes, np.einsum("nkc,nc->nk", gradient, residual), atol=1e-5)
+    np.testing.assert_allclose(squares, (residual**2).sum(axis=1), rtol=1e-5)
+
+
+def test_morton_code_interleaves_bits():
+    x, y = np.random.default_rng(0).integers(0, 1 << 16, (2, 50))
+    bits = [f"{b:016b}" for b in x], [f"{b:016b}" for b in y]
+    wanted = [
+        int("".join(q + p for p, q in zip(*pair, strict=True)), 2)
+        for pair in zip(*bits, strict=True)
+    ]
+    np.testing.assert_array_equal(morton_code(x, y), wanted)
 
 
 @pytest.mark.filterwarnings("error")
