@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,12 +40,18 @@ def make_folder(path: Path, option: str = "") -> Path:
 
 
 def result_file(path: Path, option: str, suffixes: tuple[str, ...], *inputs: Path | None) -> Path:
-    """`path`, if a result may be written there; nothing is created. `ReportError` if it has none of
-    the suffixes, given as ".csv", is one of the inputs, or lies in a tile cache.
+    """`path`, if a result can be written there; nothing is created. `ReportError` if it has none of
+    the suffixes, given as ".csv", is one of the inputs, lies in a tile cache, or is not writable.
     """
+    refuse_input(path, option, *inputs)
     if path.suffix.lower() not in suffixes:
         raise ReportError(f"{option} {path}: give a file that ends in {' or '.join(suffixes)}")
-    refuse_input(path, option, *inputs)
+    if path.exists() and not path.is_file():
+        raise ReportError(f"{option} {path}: is a folder or a device; give a file's name")
+    if not path.parent.is_dir():
+        raise ReportError(f"{option} {path}: no such folder")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ReportError(f"{option} {path}: may not be written; choose another place")
     return path
 
 

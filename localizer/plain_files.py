@@ -20,10 +20,8 @@ def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
     OSError for a pipe, which may block the reader, for a device, which may have no end, and for
     more than `most` bytes.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "is not a plain file", str(path))
         data = file.read(-1 if most is None else most + 1)
     if most is not None and len(data) > most:

@@ -1,9 +1,10 @@
-"""Reads YAML settings strictly: plain types, no repeated or merge keys, no `yes` for a number, and
+"""Reads JSON and YAML strictly: plain types, no repeated or merge keys, no `yes` for a number, and
 no sexagesimal or octal numbers of YAML 1.1 (8:20 is 500).
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Hashable, Iterator
 from typing import Any
@@ -75,6 +76,18 @@ def load_yaml(text: str) -> Any:
     As with `yaml.safe_load`, ValueError for an impossible date, RecursionError for endless nesting.
     """
     return yaml.load(text, Loader=_StrictLoader)
+
+
+def load_json(text: str) -> Any:
+    """Parse a JSON document. ValueError, also for a repeated key: the last would win silently."""
+    return json.loads(text, object_pairs_hook=_told_once)
+
+
+def _told_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key stands twice")
+    return found
 
 
 def misread_booleans(

@@ -21,6 +21,7 @@ from companion.errors import CompanionError, ReportError
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import show_steps
+from companion.writing import result_file
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
@@ -233,7 +234,10 @@ def loop_table(
     out: Annotated[Path | None, typer.Option(help="file for all flights as one JSON")] = None,
 ) -> None:
     """Print one table of the flights of several runs of `loop`."""
-    rows = [row for folder in folders for row in read_rows(folder / "loop.json")]
+    files = [folder / "loop.json" for folder in folders]
+    if out is not None:
+        result_file(out, "--out", (".json",), *files)
+    rows = [row for file in files for row in read_rows(file)]
     if out is not None:
         out.write_text(json.dumps(as_data(rows), indent=1, allow_nan=False), encoding="utf-8")
     print(markdown(rows))

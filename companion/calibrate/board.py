@@ -11,7 +11,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from companion.errors import ReportError
+from companion.writing import result_file, writing
 from localizer.types import Image
 
 Paper = Literal["a4", "a3", "letter"]
@@ -57,14 +57,9 @@ def write_sheet(path: Path, paper: Paper) -> BoardPage:
     Printed at 100 %, the squares have the size stated on the sheet.
     """
     sheet = BoardPage.of(paper)
-    endings = {".pdf": _pdf, ".png": _png}
-    if path.suffix.lower() not in endings:
-        raise ReportError(f"{path}: a board is printed from .pdf or .png")
-    data = endings[path.suffix.lower()](sheet)
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
+    result_file(path, "--print", (".pdf", ".png"))
+    with writing(path, "--print"):
+        path.write_bytes(_pdf(sheet) if path.suffix.lower() == ".pdf" else _png(sheet))
     return sheet
 
 

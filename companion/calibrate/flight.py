@@ -43,8 +43,8 @@ _OURS = ("inject", "rc")
 class CalibrationResult:
     """Result of a calibration flight. solution: see `solve`; before, after: mean distance of the
     image patches from their map positions before and after the calibration, px of the stream, each
-    with free poses; frames, parts: numbers of images and patches used. gnss_bias_m: constant error
-    of the receiver, already contained in `covariance`. notes: sentences for the reader.
+    with free poses; frames, parts: numbers of images and patches used.
+    notes: sentences for the reader.
     """
 
     camera: Camera
@@ -56,7 +56,6 @@ class CalibrationResult:
     after_px: float
     frames: int
     parts: int
-    gnss_bias_m: float
     notes: tuple[str, ...]
 
     @property
@@ -136,7 +135,7 @@ def calibrate(
     covariance[u.LATE, u.LATE] += _CLOCKS_S**2
     return CalibrationResult(
         camera, mount, arm_m, solution, covariance, before_px, solution.pixel_sigma, len(sighted),
-        len(evidence.owner), bias_m, _notes(evidence, config),
+        len(evidence.owner), _notes(evidence, config),
     )  # fmt: skip
 
 

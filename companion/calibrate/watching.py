@@ -10,6 +10,7 @@ from pathlib import Path
 from companion.calibrate.views import BoardView, BoardViews
 from companion.setup.asking import read_stream_size
 from companion.sources import SourceSettings, open_source
+from companion.writing import make_folder
 from localizer.geometry.camera import Camera
 from localizer.pictures import write_rgb
 
@@ -45,7 +46,7 @@ def watch_board(
     timer.daemon = True
     timer.start()
     if keep is not None:
-        keep.mkdir(parents=True, exist_ok=True)
+        make_folder(keep, "--keep")
     last, quiet = "", 0
     try:
         for frame in feed.frames():

@@ -116,7 +116,7 @@ def self_test_command(
 ) -> None:
     """Localize over a generated map: compiles the kernels and checks this computer."""
     if out is not None:
-        refuse_input(out, "--out")
+        result_file(out, "--out", (".json",))
     from companion.preflight.self_test import self_test
 
     console, told = Console(), Console(stderr=True)

@@ -25,7 +25,7 @@ from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, tally
 from companion.trajectory import to_stamped_pose, write_trajectory
 from companion.versions import made_by
-from companion.writing import make_folder, writing
+from companion.writing import make_folder, refuse_input, writing
 from localizer.config import LocalizerConfig
 from localizer.evaluation.drawn_sensors import DrawnSensors
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -115,6 +115,7 @@ def evaluate_command(
     searched = prior in ("lost", "none")
     if known_heading and not searched:
         raise ConfigError("--known-heading goes with --prior lost or none")
+    refuse_input(report, "--report", sequence)
     _prepare(report)
     mode: PriorMode = "each" if prior == "each" else "first"
     sensors = DrawnSensors(attitude_sigma_deg, height_sigma_m, prior == "each", seed)

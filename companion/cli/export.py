@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count, show_steps, tally
+from companion.writing import result_file
 
 
 def export_command(
@@ -61,7 +62,7 @@ def klv_command(
     """Write the video as MPEG-TS with MISB ST 0601 metadata, without encoding it again."""
     from companion.reporting.klv_recording import describe_recording
 
-    path = out or video.with_suffix(".klv.ts")
+    path = result_file(out or video.with_suffix(".klv.ts"), "--out", (".ts",), video)
     with show_count(Console(stderr=True), "describing") as show:
         written = describe_recording(
             video, record, path, map_cache=map_cache, begin_s=begin, mission=mission,

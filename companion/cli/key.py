@@ -10,6 +10,7 @@ from rich.console import Console
 
 from companion.errors import ConfigError
 from companion.terminal.steps import show_work
+from companion.writing import writing
 from mavlink_bridge.errors import EndpointError
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint
@@ -30,7 +31,8 @@ def key_command(
             raise ConfigError(f"--install {install}: {error}") from error
     console = Console()
     if not file.exists():
-        create_key(file)
+        with writing(file):
+            create_key(file)
         console.print(f"{file}: made; keep a copy, and keep it from others", soft_wrap=True)
     elif install is None:
         raise ConfigError(f"{file}: is there already and not overwritten; give another name")

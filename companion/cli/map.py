@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -18,7 +17,7 @@ from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
-from companion.writing import refuse_input, result_file, writing
+from companion.writing import result_file, writing
 
 if TYPE_CHECKING:
     from localizer.map.importers.rules import ImportRules
@@ -225,9 +224,6 @@ def info(
         result_file(geojson, "--geojson", (".geojson", ".json"))
     if kml is not None:
         result_file(kml, "--kml", (".kml",))
-    for option, file in (("--geojson", geojson), ("--kml", kml)):
-        if file is not None:
-            _require_place(option, file)
     from localizer.geometry.antimeridian import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
@@ -326,10 +322,9 @@ def render(
     ),
 ) -> None:
     """Render the map and its depth from a pose."""
-    if out.suffix.lower() != ".png":
-        raise typer.BadParameter(f"--out {out}: give a name that ends in .png")
     depth = out.with_name(f"{out.stem}_depth{out.suffix}")
-    _require_place("--out", out, depth)
+    for file in (out, depth):
+        result_file(file, "--out", (".png",))
     from localizer.geometry.camera import Camera
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection import inspect
@@ -355,7 +350,7 @@ def export(
     ] = None,
 ) -> None:
     """Write the map's surface as one GLB (y up, metres about the cache's origin)."""
-    _require_place("--out", out)
+    result_file(out, "--out", (".glb",))
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import export_glb
 
@@ -381,15 +376,3 @@ def _make_overview(cache: Path) -> None:
         with opened as relocalizer:
             view = relocalizer.overview
             Console().print(f"overview: {view.area_km2:.2f} km², {view.nbytes / 1e6:.1f} MB")
-
-
-def _require_place(option: str, *files: Path) -> None:
-    """Check that the files can be written, before the long computation."""
-    for file in files:
-        refuse_input(file, option)
-        if file.is_dir():
-            raise typer.BadParameter(f"{option} {file}: is a folder; give a file's name")
-        if not file.parent.is_dir():
-            raise typer.BadParameter(f"{option} {file}: no such folder")
-        if not os.access(file if file.exists() else file.parent, os.W_OK):
-            raise typer.BadParameter(f"{option} {file}: may not be written; choose another place")

@@ -11,6 +11,7 @@ from rich.console import Console
 from companion.errors import ReportError
 from companion.terminal.links import file_link
 from companion.terminal.steps import show_steps
+from companion.writing import result_file
 
 
 def report_command(
@@ -25,10 +26,10 @@ def report_command(
     ] = False,
 ) -> None:
     """Write one self-contained HTML file and print its path."""
-    if out is not None and out.suffix.lower() not in (".html", ".htm") and not out.is_dir():
-        raise ReportError(f"{out}: give a name that ends in .html")
-    if out is not None and out.is_file() and not overwrite:
-        raise ReportError(f"{out}: is there already; --overwrite replaces it")
+    if out is not None:
+        result_file(out, "--out", (".html", ".htm"))
+        if out.exists() and not overwrite:
+            raise ReportError(f"{out}: is there already; --overwrite replaces it")
     with show_steps(Console(stderr=True)) as say:
         say(f"reading {folder}")
         from companion.reporting.report import NAME, write_page

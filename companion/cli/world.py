@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from companion.terminal.steps import show_work
+from companion.writing import writing
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -35,6 +36,7 @@ def build(
     if variant not in ("survey", "live"):
         raise typer.BadParameter(f"variant is survey or live, not {variant!r}")
     chosen: Literal["survey", "live"] = "survey" if variant == "survey" else "live"
-    with show_work(Console(stderr=True), f"building world {seed} ({variant})"):
+    work = show_work(Console(stderr=True), f"building world {seed} ({variant})")
+    with writing(out, "--out"), work:
         info = build_world(seed, out, variant=chosen, size_m=size)
     Console().print(f"[green]{out}/tileset.json[/]: world {seed}, {info.size_m:.0f} m a side")

@@ -175,13 +175,13 @@ def _pose(tags: PhotoTags, frame: LocalFrame, lift_m: float) -> StampedPose:
         said = tags.telemetry()
         if said.view is None:
             raise ValueError("no gimbal angles in its XMP or NAME.xmp; which camera took it?")
+        if tags.wrong_place is not None:
+            raise ValueError(tags.wrong_place)
         if said.position is None or tags.altitude is None:
             raise ValueError("no position with a height in EXIF or XMP: no GNSS fix; remove it")
         at = said.position
         height_m = tags.altitude.value_m + lift_m
         position = Geodetic(at.latitude_deg, at.longitude_deg, height_m)
-    except FootageError as error:
-        raise PoseFileError(str(error)) from error
     except (ValueError, GeoreferenceError) as error:
         raise PoseFileError(f"{path}: {error}") from error
     place = frame.enu_from_geodetic(at.latitude_deg, at.longitude_deg, height_m)

@@ -17,6 +17,7 @@ import numpy as np
 from companion.errors import ConfigError, RecordError, ReportError
 from companion.offline.record import RecordTables, is_time_ns, read_record
 from companion.offline.tables import Columns
+from companion.writing import result_file
 from localizer.errors import LocalizerError
 from localizer.map.cache.cache import TileCache
 from localizer.plain_files import plain_bytes
@@ -75,8 +76,7 @@ def export_mcap(
     require_extra()
     from companion.export.mcap_file import McapFile
 
-    path = out or folder / MCAP_NAME
-    _require_free(path)
+    path = result_file(out or folder / MCAP_NAME, "--out", (".mcap",))
     partial = path.with_name(f".{path.name}.part")
     notes = list(tables.notes)
     if not tables.utc_ns:
@@ -135,14 +135,6 @@ def _rows(
     for i in np.argsort(columns[time], kind="stable"):
         row = {name: columns[name][i] for name in names}
         yield int(row[time]) + offset_ns, partial(take, row)
-
-
-def _require_free(path: Path) -> None:
-    """`ReportError` if the result would replace a device or a table of a record."""
-    if path.exists() and not path.is_file():
-        raise ReportError(f"{path}: cannot be written: is not a plain file")
-    if path.suffix != ".mcap":
-        raise ReportError(f"{path}: give a name that ends in .mcap")
 
 
 def _pictures(folder: Path, offset_ns: int, take: Callable[[bytes, int], None]) -> Iterator[Step]:

@@ -114,10 +114,6 @@ class Publisher:
         with contextlib.suppress(OSError):
             self.path.unlink()
 
-    def pending_bytes(self) -> list[int]:
-        """Bytes of the message under way to each connected console; 0 if none is."""
-        return [len(c.sending) for c in tuple(self._consoles.values())]
-
     def wake(self) -> None:
         """Wake the thread, because a new frame is available. Never blocks."""
         with contextlib.suppress(OSError):

@@ -183,6 +183,9 @@ def _read_photos(
             f"{zero} of {len(tags)} photos have gimbal angles that are exactly zero: these are "
             "taken as not measured"
         )
+    wrong = [f"{t.path.name}: {t.wrong_place}" for t in tags if t.wrong_place is not None]
+    if wrong:
+        notes.append(f"{len(wrong)} photos lose their position, the first: {wrong[0]}")
     turned = sum((t.exif_number("Orientation") or 1) != 1 for t in tags)
     if turned:
         notes.append(f"{turned} photos are marked as rotated; they are used as the sensor saw them")

@@ -99,7 +99,9 @@ class PhotoTags:
         return (width > height) != (self.width > self.height)
 
     def telemetry(self) -> Telemetry:
-        """Position and direction, as far as known. `FootageError` for a position off the Earth."""
+        """Position and direction, as far as known; no position if it is off the Earth
+        (`wrong_place`).
+        """
         return Telemetry(self.time_ns, self._position(), self.view(), self._course())
 
     def view(self) -> RecordedView | None:
@@ -129,7 +131,9 @@ class PhotoTags:
             return course
         return _number(self.gps.get(ExifTags.GPS.GPSImgDirection))
 
-    def _position(self) -> RecordedPosition | None:
+    @property
+    def _place(self) -> tuple[float, float] | None:
+        """Latitude and longitude as the tags state them; None if they are missing or both 0."""
         # "GpsLongtitude" is how some of DJI's firmwares spell it.
         latitude = self.number("GpsLatitude", "Latitude")
         longitude = self.number("GpsLongitude", "GpsLongtitude", "Longitude")
@@ -137,14 +141,22 @@ class PhotoTags:
             latitude, longitude = self._exif_place
         if latitude is None or longitude is None or (latitude == 0.0 and longitude == 0.0):
             return None
-        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-            raise FootageError(
-                f"{self.path}: its tags say latitude {latitude:g}, longitude {longitude:g}: no "
-                "place on Earth"
-            )
+        return latitude, longitude
+
+    @property
+    def wrong_place(self) -> str | None:
+        """The fault of tags whose position is off the Earth; else None."""
+        if self._place is None or (abs(self._place[0]) <= 90.0 and abs(self._place[1]) <= 360.0):
+            return None
+        latitude, longitude = self._place
+        return f"tags say latitude {latitude:g}, longitude {longitude:g}: no place on Earth"
+
+    def _position(self) -> RecordedPosition | None:
+        if self._place is None or self.wrong_place is not None:
+            return None
         told = [s for name in ("RtkStdLat", "RtkStdLon") if (s := self._sigma(name)) is not None]
         sigma = max(_RTK_M, *told) if told else self._sigma("GPSXYAccuracy") or _GNSS_M
-        return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
+        return RecordedPosition(*self._place, sigma, tuple(self._heights()))
 
     def _sigma(self, name: str) -> float | None:
         """A standard deviation in metres; None if the tag is missing or its value impossible."""

@@ -65,8 +65,6 @@ def describe_recording(
         raise RecordError(f"{record}: holds no estimate, or does not say which camera")
     if not tables.utc_ns:
         raise RecordError(f"{record}: does not say what time it was (record.json)")
-    if out.resolve() == video.resolve():
-        raise RecordError(f"{out}: is the video itself; give another file as --out")
     cache = TileCache.open(map_path)
     tables.flown_map.require_frame(cache)
     with ExitStack() as stack:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from pydantic import BaseModel
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
 from companion.settings_file import settable_fields
+from mavlink_bridge.atomic_file import replace_file
 
 
 def deployment_text(
@@ -30,11 +32,10 @@ def deployment_text(
 
 def write_deployment(text: str, path: Path, overwrite: bool) -> None:
     """Write the file; `ConfigError` if that fails, or it exists and `overwrite` is False."""
+    if path.exists() and not overwrite:
+        raise ConfigError(f"{path}: is there already; --overwrite replaces it")
     try:
-        with path.open("w" if overwrite else "x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise ConfigError(f"{path}: is there already; --overwrite replaces it") from error
+        replace_file(path, text, stat.S_IMODE(path.stat().st_mode) if path.exists() else 0o666)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -25,11 +25,6 @@ class TargetNumbers:
         self._free = cycle(_DETECTED)
         self._lock = threading.Lock()
 
-    @property
-    def known_count(self) -> int:
-        """Number of remembered names of detected targets."""
-        return len(self._numbers)
-
     def number_of(self, name: str) -> int:
         """The number of the target of that name; a new name gets the next free one."""
         if (clicked := clicked_number(name)) is not None:

@@ -7,7 +7,6 @@ rejected: a truncated model would give positions with errors of metres.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ import yaml
 from localizer.errors import CameraError
 from localizer.geometry.lens import COEFFICIENTS, LensModel, whole_coefficients
 from localizer.plain_files import plain_text
-from localizer.strict_yaml import load_yaml
+from localizer.strict_yaml import load_json, load_yaml
 
 KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 _MODEL_KEY = re.compile(r"(?i)(camera|lens|distortion|projection)?_?(model|type)|lens|projection")
@@ -72,7 +71,7 @@ def read_numbers(path: Path) -> dict[str, Any]:
         if lines and (colmap := _COLMAP.fullmatch(lines[0].strip())):
             data: Any = _of_colmap(colmap, len(lines))
         elif text.lstrip()[:1] in ("{", "["):
-            data = json.loads(text)
+            data = load_json(text)
         elif text.lstrip().startswith("<"):
             raise ValueError("it is XML; export OpenCV's YAML or COLMAP's cameras.txt")
         else:  # OpenCV's FileStorage is YAML but for its first line and its tags

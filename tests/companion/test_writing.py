@@ -47,13 +47,17 @@ def test_localize_keeps_its_priors(small_assets, small_sequence, tmp_path):
      "convert poses.txt area/manifest.json --from poses --to tum",
      "convert poses.txt poses.txt --from poses --to poses", "convert . . --from photos --to photos",
      "map raise dsm.tif fp.json --out dsm.tif", "map raise dsm.tif fp.json --out fp.json",
-     "try photos --places r/frames.csv --report r", "doctor pg.txt --page pg.html"],
+     "try photos --places r/frames.csv --report r", "doctor pg.txt --page pg.html",
+     "try r --report r", "eval r --map area --report r", "klv a.ts --record r --out a.ts",
+     "calibrate flight r --json r/record.json", "calibrate flight r --config d.json --json d.json",
+     "calibrate board --print area/board.pdf", "map info area --kml area/a.kml"],
 )  # fmt: skip
 def test_a_command_replaces_none_of_its_inputs(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("companion.cli.doctor.load_config", lambda _path: None)
     for name in ("area/index.safetensors", "area/manifest.json", "poses.txt", "dsm.tif", "fp.json",
-                 "r/frames.csv", "pg.txt", "photos/a.jpg"):  # fmt: skip
+                 "r/frames.csv", "pg.txt", "photos/a.jpg", "r/record.json", "d.json",
+                 "a.ts"):  # fmt: skip
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("kept")
     found = CliRunner().invoke(app, command.split())

@@ -58,21 +58,22 @@ def test_a_link_to_a_plain_file_is_one(tmp_path):
     ("read", "error"),
     [(read_poses, PoseFileError), (read_tum, PoseFileError), (Camera.from_json, CameraError)],
 )
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_what_has_no_end_is_a_named_error(tmp_path, read, error, kind):
-    path = Path("/dev/zero")
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_is_no_file_is_a_named_error(tmp_path, read, error, kind):
+    path = tmp_path if kind == "folder" else Path("/dev/zero")
     if kind == "pipe":
         path = tmp_path / "pipe"
         os.mkfifo(path)
-    with pytest.raises(error, match=f"{path}.*is not a plain file"):
+    with pytest.raises(error, match=f"{path}.*(is not a plain file|directory: '{path}')"):
         read(path)
 
 
-def test_json_that_nests_without_end_is_a_named_error(tmp_path):
+def test_json_that_nests_without_end_or_repeats_a_key_is_a_named_error(tmp_path):
     path = tmp_path / "camera.json"
-    path.write_text("[" * 100_000)
-    with pytest.raises(CameraError, match="cannot be read as JSON"):
-        Camera.from_json(path)
+    for text in ("[" * 100_000, '{"fx": 500, "fx": 900}'):
+        path.write_text(text)
+        with pytest.raises(CameraError, match="cannot be read as JSON"):
+            Camera.from_json(path)
     (tmp_path / "manifest.json").write_text("[" * 100_000)
     with pytest.raises(MapCacheError, match="cannot be read as JSON"):
         TileCache.open(tmp_path)

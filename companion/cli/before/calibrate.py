@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.config import load_config
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count
+from companion.writing import result_file, writing
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -45,6 +47,10 @@ def flight_command(
 
     if write and config is None:
         raise ConfigError("--write needs --config: which deployment file is to be changed?")
+    if report is not None:
+        result_file(report, "--json", (".json",), config, tlog, *record.glob("*.json"))
+    if config is not None:
+        load_config(config)
     loaded = load_record(record, 0.0, tlog, map_cache)
     with show_count(Console(stderr=True), "pictures") as count:
         found = calibrate(loaded, frames, count)
@@ -65,7 +71,9 @@ def flight_command(
     )  # fmt: skip
     console.print(_changes(wanted))
     if report is not None:
-        report.write_text(json.dumps(_figures(found, wanted, blind), indent=1), encoding="utf-8")
+        with writing(report, "--json"):
+            text = json.dumps(_figures(found, wanted, blind), indent=1)
+            report.write_text(text, encoding="utf-8")
     if write and config is not None:
         require_flown_with(config, wanted)
         kept = write_changed(config, wanted, f"calibrated by `companion calibrate flight {record}`")
@@ -153,12 +161,12 @@ def _film(
     from companion.calibrate.lens import solve_lens
     from companion.calibrate.proposal import lens_changes, write_changed
     from companion.calibrate.watching import watch_board
-    from companion.config import load_config
 
     def told(taken: int, word: str, missing: list[str]) -> None:
         wanted = "; ".join(missing[:3]) or "nothing: enough"
         console.print(f"{taken:2d} views ({word}); missing: {wanted}", highlight=False)
 
+    before = load_config(config) if config is not None else None
     filmed = watch_board(source, seconds, told, keep)
     lens = solve_lens(filmed.views, filmed.width, filmed.height)
     c = lens.camera
@@ -170,7 +178,6 @@ def _film(
     )  # fmt: skip
     if filmed.missing:
         console.print(f"not seen: {'; '.join(filmed.missing)}", style="yellow", soft_wrap=True)
-    before = load_config(config) if config is not None else None
     wanted = lens_changes(before, lens)
     console.print(_changes(wanted))
     if config is not None:

@@ -14,6 +14,7 @@ from companion.config import CompanionConfig, parse_config
 from companion.errors import CompanionError, ConfigError
 from companion.redaction import redacted
 from companion.terminal.steps import show_work
+from companion.writing import result_file
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
@@ -63,6 +64,7 @@ def init_command(
     if reference:
         typer.echo(all_settings(), nl=False)
         return
+    result_file(out, "OUT", (".yaml", ".yml"), camera)
     if out.exists() and not overwrite:
         raise ConfigError(f"{out}: is there already; --overwrite replaces it")
     notes: list[str] = []

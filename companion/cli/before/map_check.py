@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.terminal.steps import show_work
-from companion.writing import make_folder
+from companion.writing import make_folder, writing
 
 _SPEED_M_S = 10.0
 _COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
@@ -52,8 +52,9 @@ def check_command(
     make_folder(out, "--out")
     with show_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
         made = check_map(opened, MapUse(height, pixel_rad, half_view_deg))
-    for name, rgb in made.pictures.items():
-        write_rgb(out / f"{name}.png", rgb)
+    with writing(out, "--out"):
+        for name, rgb in made.pictures.items():
+            write_rgb(out / f"{name}.png", rgb)
     table = Table(box=SIMPLE_HEAD)
     for column in ("", "what", "found", "meaning"):
         table.add_column(column, overflow="fold")

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
-from companion.writing import refuse_input
+from companion.writing import result_file
 
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
@@ -138,7 +138,7 @@ def raise_command(
     height_property: HeightProperty = None,
 ) -> None:
     """Raise buildings on a terrain from footprints: a surface for `map build`."""
-    refuse_input(out, "--out", terrain, footprints)
+    result_file(out, "--out", (".tif", ".tiff"), terrain, footprints)
     from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
 
     with show_work(Console(stderr=True), "raising buildings"):

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from companion.config import load_config
 from companion.terminal.steps import show_count, show_work
-from companion.writing import make_folder
+from companion.writing import make_folder, writing
 
 
 def plan_command(
@@ -85,12 +85,13 @@ def plan_command(
             ("Track", pictures.track_picture(sheet, plan)),
             ("Ground that is seen", pictures.heat_picture(sheet, plan, cache, camera, aim)),
         )
-    for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
-        write_rgb(out / name, rgb)
-    page.write_page(plan, shown, out / "plan.html")
     legs = () if frames is None else check.flown_legs(plan.verdicts, *frames)
     document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}
-    (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    with writing(out, "--out"):
+        for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
+            write_rgb(out / name, rgb)
+        page.write_page(plan, shown, out / "plan.html")
+        (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
     _print("without vision", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
     _print("alternatives", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))

@@ -53,8 +53,9 @@ def try_command(
     from companion.recorded.footage import FootageOptions, read_footage
     from companion.trial.deployment import refuse_edited
 
+    inputs = (footage, footage / "frames.csv", places, log, camera)
     for name in ("report.html", "trial.json", "frames.csv", "deployment.yaml"):
-        refuse_input(report / name, "--report", footage, places, log, camera)
+        refuse_input(report / name, "--report", *inputs)
     make_folder(report, "--report")
     refuse_edited(report / "deployment.yaml")
     console = Console(stderr=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.pose import Array, so3_exp
 from localizer.map.importers.height_crs import datum_doubt, far_outside, horizontal_unit_m
 from localizer.plain_files import plain_text
+from localizer.strict_yaml import load_json
 
 UpAxis = Literal["y", "z"]
 
@@ -78,20 +78,12 @@ def read_georeference(path: Path) -> Georeference:
         raise GeoreferenceError(f"{path}: cannot be read: {error}") from error
     try:
         if text.lstrip().startswith("{"):
-            return _from_json(json.loads(text, object_pairs_hook=_told_once))
+            return _from_json(load_json(text))
         return _from_odm(text)
     except (
         ValueError, TypeError, KeyError, AttributeError, CRSError, GeoreferenceError, RecursionError
     ) as error:  # fmt: skip
         raise GeoreferenceError(f"{path}: not a georeference: {error!r}") from error
-
-
-def _told_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """JSON object; an error for a repeated key, of which the last would win silently."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key stands twice")
-    return found
 
 
 def _unread(data: dict[str, Any], known: set[str]) -> tuple[str, ...]:

@@ -118,7 +118,7 @@ def test_the_sheet_prints_at_true_scale(tmp_path):
     page = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
     assert page.shape[1] / page.shape[0] == pytest.approx(210 / 297, rel=1e-3)
     assert b"pHYs" in (tmp_path / "board.png").read_bytes()[:60]
-    with pytest.raises(ReportError, match="printed from"):
+    with pytest.raises(ReportError, match=r"--print .*ends in \.pdf or \.png"):
         write_sheet(tmp_path / "board.svg", "a4")
 
 

@@ -118,6 +118,17 @@ def test_zero_angles_other_lenses_and_rotated_photos_are_told(tmp_path):
     assert "4 photos are marked as rotated" in notes
 
 
+def test_a_position_off_the_earth_is_named_and_left_out(tmp_path):
+    """One such photo made the whole folder unreadable."""
+    folder = _survey(tmp_path / "p")
+    wrong = dji(GpsLatitude="124.0", GpsLongitude="8.5", FlightYawDegree="90.0")
+    write_photo(folder / "DJI_0001.JPG", wrong, exif={_FOCAL_35: 24})
+    flight = read_footage(folder, FootageOptions(tmp_path / "w"))
+    assert (len(flight.frames), flight.located_count) == (4, 3)
+    told = "1 photos lose their position, the first: DJI_0001.JPG: tags say latitude 124"
+    assert told in " ".join(flight.notes)
+
+
 def test_what_cannot_be_used_is_left_out_or_refused(tmp_path):
     folder = _survey(tmp_path / "p")
     (folder / "DJI_0001.JPG").write_bytes((folder / "DJI_0001.JPG").read_bytes()[:200])

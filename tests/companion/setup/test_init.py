@@ -1,6 +1,8 @@
 """A deployment file from questions: short, valid, and true to the schema's defaults."""
 
 import json
+import re
+import resource
 
 import cv2
 import numpy as np
@@ -145,6 +147,23 @@ def test_without_a_map_a_file_is_written_that_says_what_is_missing(tmp_path, mon
     assert f"--out {place}" in (tmp_path / "d.yaml").read_text()
     config = load_config(tmp_path / "d.yaml")
     assert (config.map, config.map_sha256) == (tmp_path / place, None)
+
+
+def test_a_full_disk_leaves_the_old_file_and_names_the_new_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "d.yaml").write_text("old")
+    words = ["init", "d.yaml", "--overwrite", "--map", "none", "--source", "a", "--no-listen",
+             "--connection", "udpin:127.0.0.1:14551", "--fov", "60",
+             "--mount", "fixed"]  # fmt: skip
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))  # each write fails
+    try:
+        done, key = (CliRunner().invoke(app, given) for given in (words, ["key", "k.key"]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert re.match("d.yaml: cannot be written", str(done.exception))
+    assert (tmp_path / "d.yaml").read_text() == "old"
+    assert re.match("k.key: cannot be written", str(key.exception))
 
 
 def test_something_else_in_the_maps_place_is_refused(tmp_path):

@@ -53,10 +53,10 @@ def test_a_console_that_is_killed_or_crashes_costs_the_flight_nothing(small_asse
     try:
         with flight.flying(), running_console(path, ConsoleConfig(listen=listen, control=True)):
             (console,) = set(_children()) - before
-            _until(lambda: len(flight.publisher.pending_bytes()) == 1)  # it has met the flight
+            _until(lambda: _connections(meeting) == 1)  # it has met the flight
             os.kill(console, how)
             assert handler.told.wait(30.0)
-            _until(lambda: flight.publisher.pending_bytes() == [])
+            _until(lambda: _connections(meeting) == 0)
             sent = flight.sent
             _until(lambda: flight.sent >= sent + 3)
             # Another one is served as the first was.
@@ -74,6 +74,11 @@ def _children() -> list[int]:
         with open(f"/proc/self/task/{task}/children") as file:
             found += [int(pid) for pid in file.read().split()]
     return found
+
+
+def _connections(listening) -> int:
+    with open("/proc/net/unix") as file:
+        return file.read().count(f" {listening}\n") - 1  # the listening socket itself
 
 
 def _until(holds) -> None:
