@@ -41,6 +41,10 @@ true; others report one moment. The end is sent as `cleared: NAME` (checks of po
 text in brackets, or by the next text, such as `injecting`, `the EKF follows` or `localization
 tracking`, after 1.5 s (up to 60 s if the alert recurs).
 
+**Repetition:** a text is sent when its alert begins, and again while it lasts only where its row
+says *every N s*; *once*: not again before a restart. An unchanged localization status is sent
+once; one that comes back, every 10 s at most.
+
 **Times:** "for 2 s" means all the time. A check without data (no fix for 1 s, no frame for 2 s, no
 IMU messages) leaves its alert as it is. "More than A, and more than B": both.
 
@@ -53,8 +57,8 @@ rc from the pilot's order until he ends it, in mode shadow never |
 pass*: it passed at most 10 min ago, and at most 30 s before the last compared fix |
 | not ready | why the shadow check has not passed: do not fly on vision. Injection then starts \
 only by `bridge.injection.force`, by the pilot (mode rc), or without GNSS if the check has not \
-failed. Sent in mode inject when fixes have waited for 10 s. Limits apply to 50 or more fixes; \
-without GNSS a failed check stays failed |
+failed. Sent in mode inject when fixes have waited for 10 s; `injecting` ends it. Limits apply \
+to 50 or more fixes; without GNSS a failed check stays failed |
 | not sent | why no position is sent (mode shadow: could be sent) |
 | output held | fixes are made, but none is sent until the alert ends |
 | reset | the first fix after *output held* increments `reset_counter`: the EKF jumps to it |
@@ -82,8 +86,7 @@ MAV_CMD_EXTERNAL_POSITION_ESTIMATE to component 197. It limits the search, and i
 | test ratio | of EKF_STATUS_REPORT (PX4: ESTIMATOR_STATUS): above 1 the EKF rejects positions |
 
 Without GNSS and without fixes, ArduPilot lands after 5 to 8 s
-([when vision ends](../how-to/when-vision-ends.md)). The same localization status is sent every 10 s
-at most.
+([when vision ends](../how-to/when-vision-ends.md)).
 """
 _TABLE = """
 ## {}
@@ -126,6 +129,7 @@ def _row(spec: AlertSpec) -> str:
         spec.severity.name.lower() if spec.severity <= Severity.ERROR else "",
         _ACTIONS[spec.action],
         "inhibit" if Inhibits.INJECTION in spec.inhibits else "",
+        f"every {spec.repeat_s:.0f} s" if spec.repeat_s else "",
     )
     name = ", ".join([f"`{spec.id.value}`", *filter(None, marks)])
     return f"| {shown.removeprefix(PREFIX)}<br>{name} | {'<br>'.join(lines)} |\n"

@@ -41,8 +41,8 @@ class ReferenceImage:
 
 @dataclass(frozen=True)
 class OverlayFrame:
-    """A frame with its pose and rendered view; both None while nothing is localized. camera: of the
-    image as sent.
+    """A frame with its pose and rendered view. pose: world_from_camera, None without an estimate;
+    view: None also for a rejected one; camera: of the image as sent.
     """
 
     image: np.ndarray
@@ -52,8 +52,8 @@ class OverlayFrame:
 
 
 def unpack(message: Message) -> OverlayFrame:
-    """A frame's message as arrays, which are read-only views of its body. The camera is resized to
-    the image. ValueError if the body is too short.
+    """A frame's message as arrays, which are read-only views of its body. Images are RGB; the
+    camera is resized to the image. ValueError if the body is too short.
     """
     head, body = message.head, message.body
     width, height = head["image"]

@@ -81,7 +81,7 @@ class StepDetector:
         return math.hypot(newest.north - before.north, newest.east - before.east)
 
     def add(self, step: PositionStep) -> PositionStep | None:
-        """Add an accepted fix's offset; returns a step once it has lasted, otherwise None."""
+        """Add the offset of a fix that the jump check passed; returns a step once it has lasted."""
         self._north += step.offset_m[0]
         self._east += step.offset_m[1]
         here = _Offset(step.time_ns, self._north, self._east, step.sigma_m)
@@ -161,7 +161,9 @@ class StepUncertainty:
         return min(self.metres + self._finder.suspected_m, self._most_m)
 
     def add(self, step: PositionStep) -> PositionStep | None:
-        """Add an accepted fix's offset from its prediction; returns a step that has lasted now."""
+        """Add the offset of a fix that the jump check passed, sent or not. Returns a step that has
+        lasted now, with the time of its first fix; otherwise None.
+        """
         found = self._finder.add(step)
         if found is not None:
             self._add_up(found)
@@ -180,8 +182,8 @@ class StepUncertainty:
             self._set(self._along_m, self._across_m + math.hypot(north, east))
 
     def confirm_timestamps(self) -> None:
-        """Clear the steps along the direction of flight: the timestamps were confirmed, so there is
-        no delay.
+        """Clear the steps along the direction of flight: the calibration watch (not TIMESYNC) has
+        measured that the frames' times lag less than these steps would need.
         """
         self._set(0.0, self._across_m)
 

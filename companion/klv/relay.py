@@ -105,7 +105,9 @@ class KlvRelay:
                 self._exposures.pop(next(iter(self._exposures)))
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
-        """Store an accepted estimate's pose; another ends the wait for it. Never blocks."""
+        """Take every estimate. An accepted one's pose is stored; a rejected or later one ends the
+        wait of earlier frames, which go without metadata. Never blocks.
+        """
         with self._condition:
             self._newest_ns = max(self._newest_ns, estimate.exposure_time_ns)
             if estimate.accepted:

@@ -109,12 +109,12 @@ def _fisheye_angle(k: tuple[float, ...], radius: Array) -> Array:
 
 
 def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Project) -> str:
-    """Why a lens model is impossible; "" if it is possible. size: of the image, px; rays, project:
-    the camera's functions.
+    """Why a lens model is impossible; "" if it is possible. size: of the image, px; rays (z = 1),
+    project: the camera's functions.
 
     Two conditions hold for a possible lens. Every pixel of a grid up to the image's edges has a ray
-    that projects back onto this pixel. A straight line between two corners is not bent more than by
-    any real lens.
+    that projects back onto this pixel, and neighbouring rays keep the pixels' order. A straight
+    line between two corners is not bent more than by any real lens.
     """
     u, v = np.meshgrid(*(np.linspace(0.0, side, _GRID) for side in size))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)

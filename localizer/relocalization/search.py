@@ -358,7 +358,7 @@ class _MapSearch:
         return not ((first > high).any() or (last < low).any())
 
     def suited_at(self, scale: int) -> dict[Block, SuitedOrigins]:
-        """The blocks with an origin that suits the scale's height, at any heading."""
+        """The blocks with an origin that suits the height `heights[scale]`, at any heading."""
         cells = self.cells(float(self.heights[scale]))
         ground = {b: self.ground(b, cells) for b in self.blocks}
         origins = {

@@ -13,6 +13,7 @@ _VIDEO = f"{_TAKE_OVER}; check the camera and its link"
 _NO_FIX = "no fixes"
 _DISK = "check the disk"
 _CLICK = "click again"
+_ONLY_NEAR = "a lost position is found again only near the autopilot's own position (GNSS)"
 _RESOLUTION = "set the camera to the calibrated resolution"
 _CONSOLE = "console: "
 _GONE, _NO_TARGET = "the target is deleted", "no target is made"
@@ -42,7 +43,8 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
               "ten frames in a row are rejected, or odometry fails during `bridging` or while the "
               "predicted position is too uncertain",
-              "a position is found and confirmed", f"{_NO_FIX}; N: time since the last fix",
+              "a position is found and confirmed",
+              f"{_NO_FIX}; N: time since the map last confirmed the position (0: never)",
               _TAKE_OVER),
     condition(A.EKF_UNCERTAIN, WARNING, "autopilot position +-{metres:.0f} m", {"metres": "m"},
               "`lost` is active, and the autopilot has a position", WHILE,
@@ -63,11 +65,12 @@ HEALTH: tuple[AlertSpec, ...] = (
               _TAKE_OVER),
     condition(A.NO_SEARCH, WARNING, "no map search possible, see the log", {},
               "the map search could not be prepared", "a restart",
-              "a lost position is found again only near the autopilot's own position (GNSS)",
+              _ONLY_NEAR,
               "on the ground restart the program; in flight stay where vision works"),
     condition(A.SEARCH_HANGS, WARNING, "the search hangs", {},
-              "the search thread has made no progress for 2 min", WHILE, "as `no_search`",
-              "as `no_search`"),
+              "a search (position lost or not yet found) has made no progress for 2 min",
+              "it goes on; usually only a restart", _ONLY_NEAR,
+              f"{_TAKE_OVER}; on the ground restart the program"),
     condition(A.SEARCHING, INFO, "searching the map", {},
               "no position is known since the start", "the first frame is processed", _NO_FIX,
               "give the position"),
@@ -90,10 +93,11 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.VIDEO_STALLED, WARNING, "video feed stalled", {},
               "no frame was received for 1 s (at the start 3 s)", WHILE, _NO_FIX, _VIDEO),
     condition(A.VIDEO_SCALED, WARNING, "video scaled", {},
-              "frames have another size than `camera.model`, with the same aspect ratio", WHILE,
+              "frames have another size than `camera.model`, with the same aspect ratio; its "
+              "end is not sent", WHILE,
               "the camera model is scaled; fixes are wrong if the camera crops", _RESOLUTION),
     condition(A.MAP_UNREADABLE, WARNING, "map unreadable", {}, "map tiles cannot be read from disk",
-              "all of them have been read",
+              "all of them have been read; no text",
               "coarser tiles replace them: fixes are less accurate", _DISK),
     condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {},
               "a write to the record failed, or its disk was missing at a restart", "a restart",
@@ -107,7 +111,8 @@ HEALTH: tuple[AlertSpec, ...] = (
           f"it restarts at once; {_NO_FIX} for some seconds", _TAKE_OVER),
     event(A.COMPANION_WAITS, CRITICAL, "companion {how} ({what}), again in {seconds:.0f} s",
           {"how": ProcessFault, "what": "name", "seconds": "s"},
-          "as `companion_restarts`, five times in 5 min, and no standby process is ready",
+          "with `--supervised`: the flight process died or hung five times in 5 min, and no "
+          "standby is ready",
           f"it restarts after N (2 to 30 s); {_NO_FIX} until then", _TAKE_OVER),
     event(A.DEPLOYMENT_LOST, WARNING, "deployment file lost, flown as before", {},
           "at a restart after a crash the deployment file cannot be used",
@@ -168,7 +173,8 @@ TARGETS: tuple[AlertSpec, ...] = (
               "look at the video, and click again"),
     condition(A.TARGET_HELD, INFO, "target {number}: kept, its look has changed", _NUMBER,
               "a standing target is not seen for 3 s, after a slow change of its image",
-              "it looks as before, or the target ends", "its position is kept and reported",
+              "it looks as before (no text), or the target ends",
+              "its position is kept and reported",
               NOTHING),
     event(A.TARGET_BACK, INFO, "target {number} is at its place again", _NUMBER,
           "after `target_may_have_left` it looks as before", "the target has not moved", NOTHING),
@@ -188,9 +194,11 @@ CONSOLE: tuple[AlertSpec, ...] = (
           "follows", NOTHING, lead=_CONSOLE),
     event(A.CONSOLE_BOX, NOTICE, "target box at {x:.2f} {y:.2f}", {"x": "", "y": ""},
           "the operator draws a box in the console's video",
-          "as `console_target`; X Y: its top left corner", NOTHING, lead=_CONSOLE),
+          "a target is requested; X Y: the box's top left corner, as shares of width and height",
+          NOTHING, lead=_CONSOLE),
     event(A.CONSOLE_HINT, NOTICE, "hint {latitude:.4f} {longitude:.4f} +-{metres:.0f} m",
           {"latitude": "deg", "longitude": "deg", "metres": "m"},
           "the operator gives the position in the console",
-          "searches of the next 2 min look within N m", NOTHING, lead=_CONSOLE),
+          "N N: latitude, longitude; searches of the next 2 min look within +-N m", NOTHING,
+          lead=_CONSOLE),
 )  # fmt: skip

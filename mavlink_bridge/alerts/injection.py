@@ -11,9 +11,8 @@ _NOT_SENT, _NOT_READY = "not sent: ", "not ready: "
 _TAKE_OVER = "take over"
 _DOCTOR = "after landing run `companion doctor`"
 _LANDMARKS = "check landmarks"
-_UNVERIFIED = "map and calibration are not verified"
 _MAP = "check map and calibration"
-_NOT_VERIFIED = "not verified yet"
+_UNVERIFIED = "not verified yet"
 _NOT_USED = "the EKF uses no fix"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
@@ -56,7 +55,9 @@ INJECTION: tuple[AlertSpec, ...] = (
               f"{_TAKE_OVER}; check the rate of ATTITUDE", lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
               "the horizontal sigma N of a fix is above 10 m", WHILE,
-              "the position is too uncertain (velocity: as `hpl_over_limit`)", _TAKE_OVER,
+              "the position is too uncertain; during `bridging` ArduPilot still receives the "
+              "velocity",
+              _TAKE_OVER,
               lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
@@ -72,10 +73,10 @@ INJECTION: tuple[AlertSpec, ...] = (
               "injection does not start", f"act on that alert; {_TAKE_OVER}", lead=_NOT_SENT),
     condition(A.SHADOW_NOT_COMPARED, WARNING, "no fix compared with GNSS", {},
               "no fix was compared", WHILE,
-              _NOT_VERIFIED, "wait; check that GNSS has a 3D fix", lead=_NOT_READY),
+              _UNVERIFIED, "wait; check that GNSS has a 3D fix", lead=_NOT_READY),
     condition(A.SHADOW_FEW_FIXES, WARNING, "{fixes:.0f} of {needed:.0f} fixes",
               {"fixes": "fixes", "needed": "fixes"},
-              "fewer than 50 fixes were compared", WHILE, _NOT_VERIFIED, "wait",
+              "fewer than 50 fixes were compared", WHILE, _UNVERIFIED, "wait",
               lead=_NOT_READY),
     condition(A.SHADOW_RATE, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.0f}",
               {"hertz": "Hz", "needed": "Hz"},
@@ -162,7 +163,7 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
               "the median age of 50 fixes is above what the firmware can use (250 ms, PX4 300 ms)",
-              "below 90 % of it for 15 s",
+              "below 90 % of it for 15 s (`fixes_in_time`)",
               "fixes are extrapolated by up to 0.5 s; older ones are not sent",
               f"{_LANDMARKS}; on the ground use a faster computer or a smaller `localizer.width`"),
     event(A.FIXES_IN_TIME, INFO, "fixes are in time again", {},

@@ -92,7 +92,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               {"metres": "m"},
               "armed: the EKF's position steps by 3 m more than its velocity explains",
               "for 10 s fixes move as the IMU measures and are not held; or disarmed",
-              "the EKF was reset to an unconfirmed position; `ekf_follows` waits for the end",
+              "the EKF was reset, also by a *reset* or another source set: not yet confirmed; "
+              "`ekf_follows` waits for the end",
               "check landmarks", inhibits=Inhibits.EKF_OK),
     AlertSpec(A.VIDEO_TIMESTAMPS, ERROR, "video timestamps", "video timestamps not monotonic", {},
               "for 0.5 s no frame, of five or more, is newer than those before",
@@ -150,7 +151,7 @@ MONITOR: tuple[AlertSpec, ...] = (
               "{component} stalled {seconds:.0f} s", {"seconds": "s", "component": "name"},
               "the thread `health` has not run for 4 s", "it runs for 3 s",
               "health.json, the heartbeat's state and texts such as `localization lost` are out of "
-              "date", _IF_LASTS,
+              "date; with `--supervised` the process is replaced (`companion_restarts`)", _IF_LASTS,
               clear_s=3.0, repeat_s=10.0),
 )  # fmt: skip
 SOURCES: tuple[AlertSpec, ...] = (
@@ -159,9 +160,9 @@ SOURCES: tuple[AlertSpec, ...] = (
               "the EKF uses vision, and for 2 s GNSS with a 3D fix differs from vision (*off "
               "vision*) or IMU (*off IMU*), scatters (*noise*), or states over 5 m accuracy "
               "(*claimed*)",
-              "no 3D fix; the EKF uses GNSS; or GNSS agrees for 5 s",
-              "the EKF stays on vision; GNSS is jammed, spoofed or not settled, or the map has an "
-              "offset",
+              "without a text: no 3D fix, or the EKF uses GNSS; GNSS agrees for 5 s",
+              "the EKF stays on vision; N: the difference or stated accuracy; GNSS is jammed, "
+              "spoofed or not settled, or the map has an offset",
               "select GNSS only if landmarks confirm it",
               cleared_text="GNSS agrees with vision", raise_s=2.0, clear_s=5.0, repeat_s=10.0),
 )  # fmt: skip

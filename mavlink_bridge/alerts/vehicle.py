@@ -20,7 +20,7 @@ _SIGN = "check the wiring; sign the link"
 _TAKE_OVER = "take over"
 _LANDMARKS = "check landmarks"
 _CABLE = "take over; check the link to the flight controller"
-_NO_LINK = "no fix reaches the autopilot; this text arrives only over `bridge.ground_connection`"
+_NO_LINK = "no fix reaches the autopilot; the text comes only over `bridge.ground_connection`"
 _AS_BEFORE = "nothing changes: a gimbal that follows a target goes on"
 _MOUNT = "check the gimbal's MNT1 parameters"
 _SENT_OR_NOT = "*injecting*: fixes are sent; *nothing is injected*: the EKF has no position"
@@ -31,56 +31,60 @@ VEHICLE: tuple[AlertSpec, ...] = (
     condition(A.FC_LOST, WARNING, "flight controller lost: no heartbeat 3 s", {},
               "no heartbeat for 3 s, after earlier ones", "`fc_back`", _NO_LINK, _CABLE),
     event(A.FC_BACK, INFO, "flight controller is back", {}, "a heartbeat after `fc_lost`",
-          "MAVLink works again", NOTHING),
+          "MAVLink works again and injection goes on; messages relative to the origin wait for "
+          "`origin_known`", NOTHING),
     condition(A.FC_SILENT, WARNING, "no heartbeat from the flight controller", {},
               "no heartbeat in the first 5 s (in health.json: for 3 s at any time)",
-              "`fc_found`", "as `fc_lost`", "as `fc_lost`"),
+              "`fc_found`", _NO_LINK, _CABLE),
     event(A.FC_REBOOTED, WARNING, "flight controller rebooted", {},
           "the boot time in its messages ran back",
-          "the EKF restarted with its first source set; messages relative to its origin wait for "
-          "`origin_known`",
+          "the EKF restarted with its first source set; injection goes on, but messages relative "
+          "to the origin wait for `origin_known`",
           "check the EKF source set"),
     condition(A.GNSS_LOST, WARNING, "GNSS lost, {output}", {"output": Output},
-              "no 3D fix for 1 s (brief ones do not reset the count), or no GNSS report for 2.5 s",
-              "`gnss_back`", _SENT_OR_NOT,
+              "after a 3D fix: none for 1 s (brief ones do not reset the count), or no GNSS report "
+              "for 2.5 s",
+              "`gnss_back`", f"{_SENT_OR_NOT}; `bridge.switch.enabled` may select vision",
               f"if nothing is injected, {_TAKE_OVER}"),
     event(A.GNSS_BACK, INFO, "GNSS is back", {},
           "after `gnss_lost`: a 3D fix for 5 s, and no `gnss_refused`", "GNSS can be used again",
           "select the GNSS source set if you want it"),
     event(A.ARMED_WITHOUT_GNSS, WARNING, "armed without GNSS, {output}", {"output": Output},
-          "at arming, or when the program meets an armed vehicle: no 3D fix in the last 1.5 s",
+          "at arming, or when the program meets an armed vehicle: the newest GNSS report "
+          "has no 3D fix or is over 1.5 s old",
           _SENT_OR_NOT,
           "on the ground: do not take off unless planned; in flight, if nothing is injected, "
           f"{_TAKE_OVER}"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
           "UDP: MAVLink arrives from another address than `bridge.sender` or, if not set, the "
-          "first autopilot (`bridge.ground_connection`: the first ground station)",
+          "first autopilot (`bridge.ground_connection`: the first ground station); "
+          "once for each",
           "it is ignored; if it is the autopilot's, no fix reaches it",
           "set `bridge.sender` to the autopilot's address; find the sender"),
     event(A.GIMBAL_IGNORED, WARNING, "gimbal {component}, device {device} ignored",
-          {"component": "id", "device": "id"}, "a second gimbal reports its attitude",
+          {"component": "id", "device": "id"}, "a second gimbal reports its attitude; once",
           "only the first gimbal's angles are used",
           "set `bridge.camera.gimbal_component` to the camera's gimbal"),
     event(A.SECOND_COMPANION, WARNING, "another companion is component {component}",
-          {"component": "id"}, "a heartbeat with this program's own ids is received",
+          {"component": "id"}, "a heartbeat with this program's own ids is received; once",
           "another program uses the same ids, and may send fixes too",
           f"{_TAKE_OVER}; stop one of them"),
     event(A.DUPLICATE_SYSTEM_ID, WARNING, "two autopilots have system id {system}",
           {"system": "id"},
           "this id comes from a second autopilot, make or firmware version, or boot times "
-          "alternate",
+          "alternate; once",
           "the data of both are mixed",
           f"{_TAKE_OVER}; on the ground change one system id"),
     event(A.AUTOPILOT_IGNORED, WARNING, "autopilot {system} ignored, using {used}",
           {"system": "id", "used": "id"}, "an autopilot with another system id is heard, and "
-          "`bridge.system_id` is not set", "its messages are ignored",
+          "`bridge.system_id` is not set; once", "its messages are ignored",
           "set `bridge.system_id` to your vehicle's"),
     event(A.ARMING_ALTERNATES, WARNING, "system {system} armed, disarmed in turn", {"system": "id"},
-          "heartbeats change from armed to disarmed three times in 10 s",
+          "heartbeats change from armed to disarmed three times in 10 s; once",
           "another sender may forge heartbeats; the vehicle counts as armed",
           _SIGN),
     event(A.TIMESYNC_CONTRADICTS, WARNING, "TIMESYNC contradicts time stamps", {},
-          "three answers in 10 s are over 10 s off the autopilot's timestamps",
+          "three answers in 10 s are over 10 s off the autopilot's timestamps; once",
           "a second system may answer; its answers are ignored", _SIGN),
     condition(A.TIMESYNC_UNANSWERED, WARNING, "TIMESYNC unanswered: stamps may drift", {},
               "no answer for 15 s, after earlier ones, although heartbeats arrive",
@@ -89,7 +93,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "check the link to the flight controller",
               "TIMESYNC is answered again"),
     event(A.ORIGIN_REFUSED, WARNING, "EKF origin refused: {metres:.0f} m off", {"metres": "m"},
-          "GPS_GLOBAL_ORIGIN changes while armed",
+          "GPS_GLOBAL_ORIGIN changes while armed; once",
           "fixes stay relative to the previous origin; somebody may forge the message",
           _SIGN),
     event(A.ORIGIN_MOVED, INFO, "EKF origin moved; positions follow it", {},
@@ -99,10 +103,12 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "the first GPS_GLOBAL_ORIGIN after the start, a reboot or a lost link",
           "messages relative to it can be sent", NOTHING),
     event(A.ORIGIN_DIFFERS, INFO, "EKF origin {metres:.0f} m from configured one", {"metres": "m"},
-          "as `origin_known`, but over 1 m from `bridge.origin`",
-          "fixes are relative to the EKF's origin", "check `bridge.origin`"),
+          "the first GPS_GLOBAL_ORIGIN, as for `origin_known`, is over 1 m from `bridge.origin`",
+          "fixes are relative to the EKF's origin, which GNSS may have set",
+          "check `bridge.origin`"),
     condition(A.UNKNOWN_FIRMWARE, WARNING, "unknown firmware, using the safe profile", {},
-              "AUTOPILOT_VERSION names neither ArduPilot 4.5 or newer nor PX4 1.15 or newer",
+              "AUTOPILOT_VERSION names neither ArduPilot 4.5 or newer nor PX4 1.15 or newer; "
+              "its end is not sent",
               WHILE, "fixes are sent with the most cautious settings",
               "check the firmware's version"),
     condition(A.MESSAGE_UNSUPPORTED, WARNING, "unsupported: {message}", {"message": "name"},
@@ -129,7 +135,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
     condition(A.SOURCE_SET_HELD, WARNING, "no switch: {cause}, {why}",
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
               "GNSS is lost, glitches or is far from vision for 1.5 s, but vision must not be "
-              "selected (`bridge.switch.enabled`); repeated every 10 s", WHILE,
+              "selected (`bridge.switch.enabled`); repeated every 10 s, "
+              "its end is not sent", WHILE,
               "the EKF stays on its set. *not ready*: no valid pass, or an alert inhibits; *EKF "
               "with GNSS*: it is nearer to GNSS than to vision; *set N chosen*: by the pilot",
               "select the source that landmarks confirm"),
@@ -155,7 +162,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "signed)"),
     event(A.SENDERS_REFUSED, WARNING, "system {system} and more refused: {why}",
           {"system": "id", "why": SenderRefusal},
-          "a fourth system does so; further ones are not reported",
+          "a fourth system (N) sends a command that it may not; further ones are not reported "
+          "until a restart",
           "their commands are denied", "as for `sender_refused`"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
           "the ground station gives the position; N: its sigma, at least 10 m, without one 100 m",

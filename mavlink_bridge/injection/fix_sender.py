@@ -142,8 +142,8 @@ class FixSender:
         self._command = None if self._command is None else PositionCommand()
 
     def step(self, link: Link, state: VehicleState, mode: Mode, now_ns: int) -> None:
-        """Make the message that is due; send it in mode ``inject``, and only compare its position
-        with GNSS in ``shadow``. Report why none is made or sent. mode: not ``off``.
+        """Make the message that is due; send it in mode ``inject``, in ``shadow`` only queue its
+        position for the comparison with GNSS. Report why none is made or sent. mode: not ``off``.
         """
         profile = select_profile(state.autopilot, state.version)
         context = InjectionContext(self._origin.origin, profile, self._attitude_at, link.system_id)

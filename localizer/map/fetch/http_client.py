@@ -43,7 +43,7 @@ class RequestLimits:
 
 @dataclass(frozen=True)
 class HttpAnswer:
-    """An HTTP response. status: 200 or 206."""
+    """An HTTP response. status: 200, 206, or one of the request's `missing`."""
 
     status: int
     kind: str

@@ -46,7 +46,8 @@ class GltfMaterial:
 
 
 def material_of(material: dict[str, Any]) -> GltfMaterial:
-    """Parse a glTF material.
+    """Parse a glTF material (its JSON object). `MapSourceError`: colours of a wrong count; other
+    malformed values raise one of `gltf.MALFORMED`.
 
     Specular-glossiness is preferred to the metallic fallback if it has a texture, or if the
     fallback has none. A base colour that is black or has no texture is replaced by the emission:

@@ -167,7 +167,7 @@ def resolution_limit(power: Array) -> float:
     """Spatial frequency, cycles a texel up to 0.5, above which an image with this spectrum has no
     detail.
 
-    power: (bands,) at equally wide bands of frequency up to half a cycle a texel.
+    power: (_BANDS,) at equally wide bands of frequency up to half a cycle a texel.
     """
     frequency = _frequencies()
     whitened = power * frequency**_SLOPE
