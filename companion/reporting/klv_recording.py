@@ -75,7 +75,7 @@ def describe_recording(
         try:
             source = stack.enter_context(av.open(str(video)))
             stream = video_stream(source, str(video))
-        except (OSError, ValueError, IndexError) as error:
+        except av.error.FFmpegError as error:
             raise StreamOpenError(f"{video}: not a video: {error}") from error
         if not has_times(source):
             raise StreamOpenError(

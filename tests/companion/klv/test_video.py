@@ -266,6 +266,10 @@ def test_a_raw_video_without_times_is_named(flown, tmp_path):
                 raw.mux(packet)
     with pytest.raises(StreamOpenError, match="ffmpeg -r RATE"):
         describe_recording(tmp_path / "in.h264", folder, tmp_path / "out.ts", begin_s=0.0)
+    # FFmpeg's end of file, which the command line took for the user's end of input: "Aborted."
+    (tmp_path / "cut.ts").write_bytes((tmp_path / "in.ts").read_bytes()[:376])
+    with pytest.raises(StreamOpenError, match="not a video"):
+        describe_recording(tmp_path / "cut.ts", folder, tmp_path / "out.ts", begin_s=0.0)
 
 
 def test_a_video_of_another_flight_is_told_and_leaves_no_file(flown, tmp_path):
