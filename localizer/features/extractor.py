@@ -23,6 +23,7 @@ from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
 from localizer.features.openvino_session import PROVIDER as OPENVINO
 from localizer.features.providers import Expected, Session, provider_of, start_session
+from localizer.features.subgraph import cut_to_outputs
 from localizer.plain_files import plain_bytes, plain_text
 from localizer.types import FeatureLevel, FeaturePyramid, Image
 
@@ -117,7 +118,8 @@ class OnnxExtractor:
 
     size: width and height of the images to come, for the warm-up. half: TensorRT may compute in
     float16. only: TensorRT, CUDA or CPU, instead of the best. bound_to: onnxruntime's name of the
-    device where `extract_on_device` leaves its outputs; None: the provider's.
+    device where `extract_on_device` leaves its outputs; None: the provider's. finest: levels of a
+    smaller stride are not computed.
     """
 
     def __init__(
@@ -129,8 +131,10 @@ class OnnxExtractor:
         half: bool = False,
         only: str | None = None,
         bound_to: str | None = None,
+        finest: int = 1,
     ) -> None:
         self.info = read_model_info(model)
+        self._levels = tuple(level for level in self.info.levels if level.stride >= finest)
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 3
@@ -138,14 +142,18 @@ class OnnxExtractor:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self._multiple = self.info.multiple
         self._outputs = [
-            f"{kind}_{k}"
-            for k in range(len(self.info.levels))
-            for kind in ("features", "confidence")
+            f"{kind}_{k}" for k in range(len(self._levels)) for kind in ("features", "confidence")
         ]
         width, height = size or (4 * self._multiple, 4 * self._multiple)
-        expected = Expected(width, height, self._multiple, half, self.info.sha256)
+        graph = plain_bytes(model, _MOST_BYTES)
+        if self._levels != self.info.levels:
+            graph = cut_to_outputs(graph, self._outputs)
+        expected = Expected(
+            width, height, self._multiple, half, hashlib.sha256(graph).hexdigest()
+        )  # fmt: skip
         self._session = start_session(
             model,
+            graph,
             options,
             expected,
             lambda session: self._check(session, model, width, height),
@@ -177,7 +185,7 @@ class OnnxExtractor:
         arrays = session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
         return tuple(
             FeatureLevel(arrays[2 * k][0], arrays[2 * k + 1][0], level.stride)
-            for k, level in enumerate(self.info.levels)
+            for k, level in enumerate(self._levels)
         )
 
     def extract_on_device(self, rgb: Image) -> FeaturePyramid:
@@ -187,7 +195,7 @@ class OnnxExtractor:
         check_image(rgb, self._multiple)
         arrays = self._bound.run(np.ascontiguousarray(rgb)[None])
         levels = []
-        for k, level in enumerate(self.info.levels):
+        for k, level in enumerate(self._levels):
             features, confidence = arrays[2 * k], arrays[2 * k + 1]
             levels.append(
                 FeatureLevel(
@@ -210,9 +218,9 @@ class OnnxExtractor:
         if given != len(self._outputs):
             raise ModelError(
                 f"{model}: the graph has {given} outputs, its description names "
-                f"{len(self.info.levels)} levels of features and confidence"
+                f"{len(self._levels)} levels of features and confidence"
             )
-        for level, expected in zip(levels, self.info.levels, strict=True):
+        for level, expected in zip(levels, self._levels, strict=True):
             shape = (height // expected.stride, width // expected.stride, expected.channels)
             if level.features.shape != shape or level.confidence.shape != shape[:2]:
                 raise ModelError(
@@ -242,6 +250,7 @@ def load_extractor(
     threads: int = 2,
     size: tuple[int, int] | None = None,
     half: bool = False,
+    finest: int = 1,
 ) -> FeatureExtractor:
     """The extractor for `model`; None: the shipped weights.
 
@@ -255,4 +264,4 @@ def load_extractor(
         model = SHIPPED_MODEL
     if not model.exists():
         raise ModelError(f"{model}: no such model file; leave it out to use the shipped weights")
-    return OnnxExtractor(model, threads=threads, size=size, half=half)
+    return OnnxExtractor(model, threads=threads, size=size, half=half, finest=finest)

@@ -36,14 +36,14 @@ class OpenVinoSession:
     threads may call `run`. threads: number used by one call.
     """
 
-    def __init__(self, model: Path, threads: int) -> None:
+    def __init__(self, graph: bytes, threads: int) -> None:
         import openvino
 
         self._openvino: Any = openvino
         self._core = openvino.Core()
-        self._model, self._threads = model, threads
+        self._graph, self._threads = graph, threads
         self._outputs = [
-            _Output(output.get_any_name()) for output in self._core.read_model(model).outputs
+            _Output(output.get_any_name()) for output in self._core.read_model(graph).outputs
         ]
         self._compiled: OrderedDict[tuple[int, ...], Any] = OrderedDict()
         self._lock = threading.Lock()
@@ -86,7 +86,7 @@ class OpenVinoSession:
         return network
 
     def _compile(self, shape: tuple[int, ...]) -> Any:
-        model = self._core.read_model(self._model)
+        model = self._core.read_model(self._graph)
         model.reshape(shape)
         settings = {
             "INFERENCE_PRECISION_HINT": "bf16",

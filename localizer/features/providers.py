@@ -49,7 +49,7 @@ class Session(Protocol):
 @dataclass(frozen=True)
 class Expected:
     """The session's input: image size with sides divisible by `multiple`; half: float16 in
-    TensorRT; sha256: of the model.
+    TensorRT; sha256: of the graph.
     """
 
     width: int
@@ -61,6 +61,7 @@ class Expected:
 
 def start_session(
     model: Path,
+    graph: bytes,
     options: ort.SessionOptions,
     expected: Expected,
     check: Callable[[Session], None],
@@ -69,9 +70,9 @@ def start_session(
     """Start a session on the best installed provider that works. check: runs the model once, so
     that engines are built and algorithms chosen before the first frame.
 
-    only: short name of the only provider to use. A provider that cannot run the model is reported
-    by one warning. TensorRT is tried a second time without its cached engines, which may be
-    damaged. Raises `ModelError` if no provider works.
+    model: names the graph in messages. only: short name of the only provider to use. A provider
+    that cannot run the model is reported by one warning. TensorRT is tried a second time without
+    its cached engines, which may be damaged. Raises `ModelError` if no provider works.
     """
     available = available_providers()
     names = [name for name in SHORT_NAMES if name in available]
@@ -81,12 +82,12 @@ def start_session(
         kept = _kept(expected) if name == _TENSORRT else []
         try:
             try:
-                return _started(model, options, expected, names[k:], check)
+                return _started(graph, options, expected, names[k:], check)
             except Exception as error:
                 if not _removed(kept):
                     raise
                 _log.warning("features: TensorRT builds its engine again: %s", _line(error))
-                return _started(model, options, expected, names[k:], check)
+                return _started(graph, options, expected, names[k:], check)
         except Exception as error:  # onnxruntime raises its own untyped exceptions
             if k + 1 == len(names):
                 if isinstance(error, ModelError):
@@ -120,7 +121,7 @@ def load_cuda_packages() -> None:
 
 
 def _started(
-    model: Path,
+    graph: bytes,
     options: ort.SessionOptions,
     expected: Expected,
     names: list[str],
@@ -128,12 +129,12 @@ def _started(
 ) -> Session:
     """A session on the first provider; later providers run what it cannot compute."""
     if names[0] == _OPENVINO:
-        alone = OpenVinoSession(model, options.intra_op_num_threads)
+        alone = OpenVinoSession(graph, options.intra_op_num_threads)
         check(alone)
         return alone
     providers = [_configured(n, expected) for n in names if n != _OPENVINO]
     session: Session = ort.InferenceSession(
-        str(model), options, providers=providers, enable_fallback=False
+        graph, options, providers=providers, enable_fallback=False
     )
     if names[0] != session.get_providers()[0]:
         raise RuntimeError("its libraries could not be loaded")

@@ -25,7 +25,7 @@ from localizer.registration.jngo import JNGO
 from localizer.relocalization.align import FrameShift
 from localizer.relocalization.confirm import Confirmation, competitors
 from localizer.relocalization.correlate import LevelCorrelator
-from localizer.relocalization.overview import MapOverview, Progress, open_overview
+from localizer.relocalization.overview import STRIDE, MapOverview, Progress, open_overview
 from localizer.relocalization.search import SearchView, above_roofs, search
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
 from localizer.relocalization.verdict import VerifiedCandidate, decide
@@ -46,28 +46,30 @@ _MOST_UNDISTORTERS = 8
 class Relocalizer:
     """Finds the position of one frame's camera on a map. One thread uses it at a time.
 
-    extractor: the network without the detail level. The caller closes all arguments; no other
-    thread may use the renderer. height_sigma_m: RMS of the object heights that the map lacks.
-    should_stop: called all the time; True cancels.
+    extractor: the network without the detail level; coarse: its levels from the overview's stride
+    on, in a third of the time. The caller closes all arguments; no other thread may use the
+    renderer. height_sigma_m: RMS of the object heights that the map lacks. should_stop: called
+    all the time; True cancels.
     """
 
     def __init__(
         self,
         renderer: MapRenderer,
         extractor: FeatureExtractor,
+        coarse: FeatureExtractor,
         optimizer: JNGO,
         overview: MapOverview,
         config: LocalizerConfig,
         height_sigma_m: float = 0.0,
     ) -> None:
         self.overview = overview
-        self.extractor = extractor
+        self.extractor = coarse
         self._config = config.relocalization
         self._width = config.width
         self._missing_m = COMMON * height_sigma_m  # mean of what the map lacks
         self._detail = DetailExtractor(extractor)
         self._verifier = Verifier(
-            renderer, self._detail, extractor, optimizer, self._config, config.integrity,
+            renderer, self._detail, coarse, optimizer, self._config, config.integrity,
             height_sigma_m, config.anchors, config.seed,
         )  # fmt: skip
         budget = self._config.spectra_mib * 2**20
@@ -201,8 +203,9 @@ def open_relocalizer(
     renderer = NumbaRenderer(streamer, c.threads)
     try:
         extractor = load_extractor(config.model, threads=1)
+        coarse = load_extractor(config.model, threads=1, finest=STRIDE)
         overview = open_overview(
-            cache, renderer, extractor, progress=progress, should_stop=should_stop
+            cache, renderer, coarse, progress=progress, should_stop=should_stop
         )
         if overview is not None:
             # Its places are laid over the map's picture first, so that the swarm reaches them.
@@ -210,7 +213,7 @@ def open_relocalizer(
             optimizer = JNGO(registration, "numba", c.threads)
             height_sigma_m = MapHeightError.of_kind(map_kind(cache)).sigma_m
             relocalizer = Relocalizer(
-                renderer, extractor, optimizer, overview, config, height_sigma_m
+                renderer, extractor, coarse, optimizer, overview, config, height_sigma_m
             )
             return OpenRelocalizer(relocalizer, streamer, renderer)
     except BaseException:

@@ -81,7 +81,7 @@ def test_its_features_are_onnxruntimes_to_a_few_percent(monkeypatch):
 
 def test_callers_on_several_threads_have_results_of_their_own():
     pytest.importorskip("openvino", reason="the extra openvino is not installed")
-    session = OpenVinoSession(SHIPPED_MODEL, 1)
+    session = OpenVinoSession(SHIPPED_MODEL.read_bytes(), 1)
     pictures = [image(seed)[None] for seed in range(8)]
 
     def features(picture: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_it_tells_its_maker_nothing():
     code = (
         "import sys, numpy; sys.addaudithook(lambda e, a: sys.exit(e) if e.startswith('socket.') "
         "else None); from localizer.features.openvino_session import OpenVinoSession as S; "
-        f"S({str(SHIPPED_MODEL)!r}, 1)"
+        f"S(open({str(SHIPPED_MODEL)!r}, 'rb').read(), 1)"
         ".run(['confidence_0'], {'image': numpy.zeros((1, 32, 32, 3), numpy.uint8)})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, text=True)
