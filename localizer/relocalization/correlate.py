@@ -1,9 +1,9 @@
 """Normalised correlation of one patch with a level of the overview, block by block, by FFT.
 
-A block is `SIZE` cells wide; the patch, smaller than `SIZE - STEP`, is compared at `STEP` by `STEP`
-origins of each, which tile the map. What is summed over channels is a product of spectra, so that a
-patch costs one transform per channel and each block one inverse transform; the blocks' own spectra
-are kept within a budget.
+A block is `SIZE` cells wide; a patch is compared at all origins of each at which the block contains
+it. They tile the map. What is summed over channels is a product of spectra, so that a patch costs
+one transform per channel and each block one inverse transform; the blocks' own spectra are kept
+within a budget.
 """
 
 from __future__ import annotations
@@ -22,11 +22,15 @@ from localizer.relocalization.overview import OverviewLevel
 from localizer.types import Float32
 
 SIZE = 256
-STEP = 160
+MOST_CELLS = 96  # of a patch's side
+_STEPS = (192, 160)  # origins of a block's side, for patches of up to 64 and 96 cells
+# Frequencies that are kept on each side: a quarter of a cycle per cell. Above are 1 % of the energy
+# of a map's features.
+_LOW = SIZE // 4
 _COARSE = 8  # cells of the map's energy that are summed before it is correlated
 # Spectra of so many blocks and patches are multiplied row by row, so that a row of all of them
 # stays in the cache: one block and one patch after the other took more than twice as long.
-BLOCKS_TOGETHER, _PATCHES_TOGETHER = 8, 4
+BLOCKS_TOGETHER, PATCHES_TOGETHER = 8, 4
 _LEAST_ENERGY = 0.3  # of the map's usual one under a patch: bare or missing ground scores less
 
 Complex64 = NDArray[np.complex64]
@@ -34,15 +38,16 @@ Complex64 = NDArray[np.complex64]
 
 @dataclass(frozen=True)
 class Block:
-    """Origins (row, column) to (row + STEP, column + STEP) of the map, in cells; may be < 0."""
+    """Origins (row, column) to (row + step, column + step) of the map, in cells; may be < 0."""
 
     row: int
     column: int
+    step: int
 
 
 @dataclass(frozen=True)
 class _Spectra:
-    """features: (K, SIZE, SIZE/2+1) complex64; energy: (SIZE/8, SIZE/16+1) complex64."""
+    """features: (K, 2 _LOW, _LOW+1) complex64; energy: (SIZE/8, SIZE/16+1) complex64."""
 
     features: Complex64
     energy: Complex64
@@ -54,7 +59,7 @@ class _Spectra:
 
 @dataclass(frozen=True)
 class PatchSpectra:
-    """A patch's Fourier transform. features: (K, SIZE, SIZE/2+1); mask: as `_Spectra.energy`; norm:
+    """A patch's Fourier transform. features: (K, 2 _LOW, _LOW+1); mask: as `_Spectra.energy`; norm:
     root of its energy; cells: side of the patch; weight: share of cells in view.
     """
 
@@ -69,16 +74,13 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
     """Transform a patch. features: (n, n, K) weighted; mask: (n, n) in [0, 1]."""
     n = features.shape[0]
     # Row by row first: most rows are empty and stay so.
-    lines = np.zeros((features.shape[2], n, SIZE), np.float32)
-    lines[:, :, :n] = features.transpose(2, 0, 1)
-    half = scipy.fft.rfft(lines, axis=2, workers=1, overwrite_x=True)
-    spectra = scipy.fft.fft(half, SIZE, axis=1, workers=1, overwrite_x=True)
-    padded = np.zeros((SIZE, SIZE), np.float32)
-    padded[:n, :n] = mask
-    coarse = scipy.fft.rfft2(_summed(padded) / _COARSE**2, workers=1)
+    lines = scipy.fft.rfft(features.transpose(2, 0, 1), SIZE, axis=2, workers=1)
+    spectra = scipy.fft.fft(lines[:, :, : _LOW + 1], SIZE, axis=1, workers=1)
+    sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
+    coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)
     norm = float(np.sqrt((features**2).sum()))
     return PatchSpectra(
-        np.ascontiguousarray(spectra, np.complex64),
+        _low(spectra),
         np.ascontiguousarray(coarse, np.complex64),
         norm,
         n,
@@ -111,56 +113,53 @@ class LevelCorrelator:
         with self._lock:
             self._search += 1
 
-    def blocks(self) -> list[Block]:
-        """All blocks; they reach half a block beyond the map, so that patches may, too."""
+    def blocks(self, cells: int) -> list[Block]:
+        """All blocks for patches of up to so many cells a side; half of the largest patch may be
+        beyond the map.
+        """
         rows, columns = self.level.shape
-        lead = (SIZE - STEP) // 2
+        step = next(s for s in _STEPS if SIZE - s >= cells)
+        lead = (SIZE - step) // 2
         return [
-            Block(r, c) for r in range(-lead, rows - lead, STEP)
-            for c in range(-lead, columns - lead, STEP)
+            Block(r, c, step) for r in range(-lead, rows - lead, step)
+            for c in range(-lead, columns - lead, step)
         ]  # fmt: skip
 
     def correlate(self, patch: PatchSpectra, block: Block) -> Float32:
-        """Scores (STEP, STEP) of the patch at the block's origins."""
+        """Scores (step, step) of the patch at the block's origins."""
         return self.correlate_all([patch], [(0, block)])[0]
 
     def correlate_all(
         self, patches: Sequence[PatchSpectra], pairs: Sequence[tuple[int, Block]]
     ) -> list[Float32]:
-        """Scores (STEP, STEP) of each pair: number of a patch, and the block. At most
-        `BLOCKS_TOGETHER` different blocks.
+        """Scores (step, step) of each pair: number of a patch, and the block. At most
+        `PATCHES_TOGETHER` patches and `BLOCKS_TOGETHER` different blocks.
         """
         blocks = {b: k for k, b in enumerate(dict.fromkeys(b for _, b in pairs))}
         spectra = [self._spectra(b) for b in blocks]
-        products = np.empty((len(pairs), SIZE, SIZE // 2 + 1), np.complex64)
-        for first in range(0, len(patches), _PATCHES_TOGETHER):
-            some = patches[first : first + _PATCHES_TOGETHER]
-            mine = [
-                (blocks[b], n - first, at)
-                for at, (n, b) in enumerate(pairs)
-                if first <= n < first + len(some)
-            ]
-            if mine:
-                _multiplied(
-                    _filled([s.features for s in spectra], BLOCKS_TOGETHER),
-                    _filled([p.features for p in some], _PATCHES_TOGETHER),
-                    np.array(mine, np.int64),
-                    products.view(np.float32),
-                )
+        products = np.zeros((len(pairs), SIZE, _LOW + 1), np.complex64)
+        _multiplied(
+            _filled([s.features for s in spectra], BLOCKS_TOGETHER),
+            _filled([p.features for p in patches], PATCHES_TOGETHER),
+            np.array([(blocks[b], n, at) for at, (n, b) in enumerate(pairs)], np.int64),
+            products.view(np.float32),
+        )
         return [
-            self._normalised(product, spectra[blocks[b]], patches[n])
+            self._normalised(product, spectra[blocks[b]], patches[n], b.step)
             for product, (n, b) in zip(products, pairs, strict=True)
         ]
 
-    def _normalised(self, product: Complex64, block: _Spectra, patch: PatchSpectra) -> Float32:
-        """Scores (STEP, STEP) from the product of the spectra, which is overwritten."""
-        # Only the first STEP rows are origins: the others' last transform is left out.
-        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:STEP]
+    def _normalised(
+        self, product: Complex64, block: _Spectra, patch: PatchSpectra, step: int
+    ) -> Float32:
+        """Scores (step, step) from the product of the spectra, which is overwritten."""
+        # Only the first rows are origins: the others' last transform is left out.
+        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:step]
         raw = scipy.fft.irfft(columns, SIZE, axis=1, workers=1)
         small = SIZE // _COARSE
         energy = scipy.fft.irfft2(block.energy * patch.mask.conj(), (small, small), workers=1)
         least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
-        scores = np.empty((STEP, STEP), np.float32)
+        scores = np.empty((step, step), np.float32)
         _normalised(raw, energy, np.float32(least), np.float32(max(patch.norm, 1e-9)), scores)
         return scores
 
@@ -168,7 +167,7 @@ class LevelCorrelator:
         """Compile the kernels of a search."""
         channels = self.level.features.shape[0]
         patch = transform_patch(np.ones((8, 8, channels), np.float32), np.ones((8, 8), np.float32))
-        self.correlate(patch, self.blocks()[0])
+        self.correlate(patch, self.blocks(patch.cells)[0])
 
     def _spectra(self, block: Block) -> _Spectra:
         with self._lock:
@@ -208,9 +207,15 @@ class LevelCorrelator:
             )
         energy = _summed((window**2).sum(axis=0))
         return _Spectra(
-            scipy.fft.rfft2(window, workers=1).astype(np.complex64, copy=False),
+            _low(scipy.fft.rfft2(window, workers=1)),
             scipy.fft.rfft2(energy, workers=1).astype(np.complex64, copy=False),
         )
+
+
+def _low(spectra: Complex64) -> Complex64:
+    """The low frequencies (K, 2 _LOW, _LOW+1) of spectra (K, SIZE, at least _LOW+1)."""
+    kept = [spectra[:, :_LOW, : _LOW + 1], spectra[:, -_LOW:, : _LOW + 1]]
+    return np.concatenate(kept, axis=1).astype(np.complex64, copy=False)
 
 
 def _summed(values: Float32) -> Float32:
@@ -229,12 +234,13 @@ def _filled(spectra: Sequence[Complex64], count: int) -> tuple[Float32, ...]:
 def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
     """Sum over channels of block * conj(patch) for each pair (m, 3): block, patch, place in out.
 
-    blocks, patches: (K, SIZE, 2 n) each, out: (., SIZE, 2 n) float32, real and imaginary in turn.
+    blocks, patches: (K, 2 _LOW, 2 n) each, out: (., SIZE, 2 n) float32, real and imaginary in turn.
     """
     channels, rows, width = blocks[0].shape
     for i in range(rows):
+        at = i if i < _LOW else i + SIZE - 2 * _LOW
         for m in range(pairs.shape[0]):
-            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], i]
+            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], at]
             o[:] = 0
             for k in range(channels):
                 x, y = a[k, i], b[k, i]
@@ -243,17 +249,17 @@ def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
                     o[2 * j + 1] += x[2 * j + 1] * y[2 * j] - x[2 * j] * y[2 * j + 1]
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _normalised(raw, energy, least, norm, out):  # type: ignore[no-untyped-def]
     """Sample k of the coarse energy belongs to origin 8 k: between them it is interpolated."""
     step = np.float32(1.0 / _COARSE)
     for i in range(out.shape[0]):
         p = i // _COARSE
         a = (i - p * _COARSE) * step
-        for j in range(out.shape[1]):
-            q = j // _COARSE
-            b = (j - q * _COARSE) * step
-            top = energy[p, q] + b * (energy[p, q + 1] - energy[p, q])
-            low = energy[p + 1, q] + b * (energy[p + 1, q + 1] - energy[p + 1, q])
-            under = max(top + a * (low - top), least)
-            out[i, j] = raw[i, j] / (np.sqrt(under) * norm)
+        for q in range(out.shape[1] // _COARSE):
+            west = energy[p, q] + a * (energy[p + 1, q] - energy[p, q])
+            east = energy[p, q + 1] + a * (energy[p + 1, q + 1] - energy[p, q + 1])
+            slope = (east - west) * step
+            for b in range(_COARSE):
+                j = q * _COARSE + b
+                out[i, j] = raw[i, j] / (np.sqrt(max(west + b * slope, least)) * norm)

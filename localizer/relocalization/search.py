@@ -17,10 +17,11 @@ from localizer.geometry.pose import Array, Pose
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import (
     BLOCKS_TOGETHER,
-    SIZE,
-    STEP,
+    MOST_CELLS,
+    PATCHES_TOGETHER,
     Block,
     LevelCorrelator,
+    PatchSpectra,
     transform_patch,
 )
 from localizer.relocalization.overview import (
@@ -41,10 +42,11 @@ from localizer.relocalization.patch import (
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.types import Float32, Image
 
-_MOST_PX = (SIZE - STEP) * STRIDE  # of a patch's side, so that blocks overlap by it
+_MOST_PX = MOST_CELLS * STRIDE  # of a patch's side
 _UNSEEN_PX = 9  # next to what is not seen, features are of the filling
 _SUPPRESSED_M = 12.0  # about a candidate, whose neighbours are no other place
 _LEAST_HEIGHT_M = 10.0
+_HEADINGS_TOGETHER = 3  # that share an extraction: its features are turned by up to 6 degrees
 
 
 @dataclass(frozen=True)
@@ -176,15 +178,18 @@ def search(
     level = level_for(tuple(c.level for c in correlators), seen.side_m * float(heights[0]))
     correlator = next(c for c in correlators if c.level is level)
     correlator.begin()
-    run = _MapSearch(view, query, correlator, extractor, config, seen, heights)
+    run = _MapSearch(view, query, correlator, extractor, config, seen, heights, ())
+    run = replace(run, blocks=tuple(correlator.blocks(run.cells(float(heights[-1])))))
     run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
     groups = shared_extractions(heights, config.extraction_ratio)
-    jobs = [(float(a), g) for g in groups for a in heading_offsets(query, config)]
+    turns = heading_offsets(query, config)
+    starts = range(0, len(turns), _HEADINGS_TOGETHER)
+    jobs = [(turns[k : k + _HEADINGS_TOGETHER], g) for g in groups for k in starts]
     trials: list[BlockScores] = []
     scores = run.empty()
 
-    def work(job: tuple[float, list[int]]) -> list[BlockScores] | None:
-        return None if should_stop() else run.at_heading(*job, should_stop)
+    def work(job: tuple[Array, list[int]]) -> list[BlockScores] | None:
+        return None if should_stop() else run.at_headings(*job, should_stop)
 
     results = map(work, jobs) if pool is None else pool.map(work, jobs)
     for result in results:
@@ -211,11 +216,11 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class BlockScores:
-    """Scores (STEP, STEP) of one trial (heading and height) at the origins of each block that suits
+    """Scores (step, step) of one trial (heading and height) at the origins of each block that suits
     its height.
 
-    noise: root mean square of the trial's scores. Trials are compared by score divided by noise:
-    low above a hill few cells are seen, and some position always looks similar.
+    noise: root mean square of the trial's scores over ground. Trials are compared by score divided
+    by noise: low above a hill few cells are seen, and some position always looks similar.
     """
 
     trial: Rectification
@@ -224,9 +229,19 @@ class BlockScores:
 
 
 @dataclass(frozen=True)
+class SuitedOrigins:
+    """A block's origins for one height. mask: those that it suits, every `GROUND_CELLS`; known:
+    share of them all that is over ground.
+    """
+
+    mask: NDArray[np.bool_]
+    known: float
+
+
+@dataclass(frozen=True)
 class _MapSearch:
-    """Data of one search. suited: for each height, the blocks that it suits, and masks
-    (`suits`).
+    """Data of one search. blocks: of the map; suited: for each height, the blocks with an origin
+    that it suits.
     """
 
     view: SearchView
@@ -236,34 +251,57 @@ class _MapSearch:
     config: RelocalizationConfig
     seen: CameraFootprint
     heights: Array
-    suited: tuple[dict[Block, NDArray[np.bool_]], ...] = ()
+    blocks: tuple[Block, ...]
+    suited: tuple[dict[Block, SuitedOrigins], ...] = ()
+
+    @property
+    def lead(self) -> int:
+        """Cells from the first origin to the map's first cell."""
+        return -self.blocks[0].row
 
     def empty(self) -> Scores:
         rows, columns = self.correlator.level.shape
-        lead = SIZE - STEP
-        shape = (rows + lead, columns + lead)
+        shape = (rows + 2 * self.lead, columns + 2 * self.lead)
         return Scores(np.full(shape, -1.0, np.float32), np.zeros(shape, np.int32))
 
-    def at_heading(
-        self, heading: float, group: list[int], should_stop: Callable[[], bool]
+    def at_headings(
+        self, turns: Array, group: list[int], should_stop: Callable[[], bool]
     ) -> list[BlockScores] | None:
-        """Correlate one heading, at heights that share an extraction, with all their blocks."""
+        """Correlate headings and heights that share an extraction with all their blocks."""
         wanted = []
-        for scale in group:
-            trial = self.trial(heading, float(self.heights[scale]))
-            blocks = {b: where for b, where in self.suited[scale].items() if self.meets(b, trial)}
-            if blocks:
-                wanted.append((trial, blocks))
+        for heading in turns:
+            for scale in group:
+                trial = self.trial(float(heading), float(self.heights[scale]))
+                suited = self.suited[scale].items()
+                if blocks := {b: origins for b, origins in suited if self.meets(b, trial)}:
+                    wanted.append((trial, blocks))
         if not wanted:
             return []
-        features, mask = self.patch(wanted[len(wanted) // 2][0])
-        patches = [
-            transform_patch(_resized(features, trial.cells), _resized(mask, trial.cells))
-            for trial, _ in wanted
-        ]
+        middle = self.trial(float(turns.mean()), float(self.heights[group[len(group) // 2]]))
+        features, mask = self.patch(middle)
+        found: list[BlockScores] = []
+        for first in range(0, len(wanted), PATCHES_TOGETHER):
+            some = wanted[first : first + PATCHES_TOGETHER]
+            patches = [
+                transform_patch(*(_fitted(x, middle, trial) for x in (features, mask)))
+                for trial, _ in some
+            ]
+            scores = self.correlate(patches, some, should_stop)
+            if scores is None:
+                return None
+            found += scores
+        return found
+
+    def correlate(
+        self,
+        patches: list[PatchSpectra],
+        wanted: list[tuple[Rectification, dict[Block, SuitedOrigins]]],
+        should_stop: Callable[[], bool],
+    ) -> list[BlockScores] | None:
+        """Correlate patches (at most `PATCHES_TOGETHER`), each with its own blocks."""
         scores: list[list[tuple[Block, Float32]]] = [[] for _ in wanted]
         power = [0.0] * len(wanted)
-        union = [b for b in self.correlator.blocks() if any(b in blocks for _, blocks in wanted)]
+        union = [b for b in self.blocks if any(b in blocks for _, blocks in wanted)]
         for first in range(0, len(union), BLOCKS_TOGETHER):
             if should_stop():
                 return None
@@ -274,10 +312,11 @@ class _MapSearch:
             ):
                 trial, blocks = wanted[n]
                 power[n] += float(np.vdot(raw, raw)) / raw.size
-                scores[n].append((block, self.masked(raw, block, trial, blocks[block])))
+                scores[n].append((block, self.masked(raw, block, trial, blocks[block].mask)))
+        known = [sum(origins.known for origins in blocks.values()) for _, blocks in wanted]
         return [
-            BlockScores(trial, max(math.sqrt(power[n] / len(blocks)), 1e-6), scores[n])
-            for n, (trial, blocks) in enumerate(wanted)
+            BlockScores(trial, max(math.sqrt(power[n] / known[n]), 1e-6), scores[n])
+            for n, (trial, _) in enumerate(wanted)
         ]
 
     def trial(self, heading: float, height: float) -> Rectification:
@@ -288,7 +327,7 @@ class _MapSearch:
     def cells(self, height: float) -> int:
         """Side of a patch in cells."""
         side = self.seen.side_m * height / self.correlator.level.cell_m
-        return int(np.clip(round(side), 8, SIZE - STEP))
+        return int(np.clip(round(side), 8, MOST_CELLS))
 
     def patch(self, trial: Rectification) -> tuple[Float32, Float32]:
         """Weighted features (n, n, K) of one rectification, and their mask (n, n)."""
@@ -314,22 +353,24 @@ class _MapSearch:
         if region is None:
             return True
         low, high = region.bounds
-        first = self.camera_at(np.array([block.row + STEP, block.column]), trial)
-        last = self.camera_at(np.array([block.row, block.column + STEP]), trial)
+        first = self.camera_at(np.array([block.row + block.step, block.column]), trial)
+        last = self.camera_at(np.array([block.row, block.column + block.step]), trial)
         return not ((first > high).any() or (last < low).any())
 
-    def suited_at(self, scale: int) -> dict[Block, NDArray[np.bool_]]:
-        """The blocks with an origin that suits the scale's height, at any heading, and the mask of
-        these origins, every `GROUND_CELLS`.
-        """
+    def suited_at(self, scale: int) -> dict[Block, SuitedOrigins]:
+        """The blocks with an origin that suits the scale's height, at any heading."""
         cells = self.cells(float(self.heights[scale]))
-        where = {b: self.suits(self.ground(b, cells), scale) for b in self.correlator.blocks()}
-        return {b: suits for b, suits in where.items() if suits.any()}
+        ground = {b: self.ground(b, cells) for b in self.blocks}
+        origins = {
+            b: SuitedOrigins(self.suits(below, scale), float(np.isfinite(below).mean()))
+            for b, below in ground.items()
+        }
+        return {b: o for b, o in origins.items() if o.mask.any()}
 
     def ground(self, block: Block, cells: int) -> Float32:
         """Ground heights below the centres of patches of this many cells, every `GROUND_CELLS`."""
         ground = self.correlator.level.ground
-        at = np.arange(0, STEP, GROUND_CELLS) + (GROUND_CELLS + cells) // 2
+        at = np.arange(0, block.step, GROUND_CELLS) + (GROUND_CELLS + cells) // 2
         rows, columns = at + block.row, at + block.column
         i, j = rows // GROUND_CELLS, columns // GROUND_CELLS
         inside = np.ix_(i.clip(0, ground.shape[0] - 1), j.clip(0, ground.shape[1] - 1))
@@ -357,7 +398,8 @@ class _MapSearch:
         return scores.astype(np.float32, copy=False)
 
     def inside(self, block: Block, trial: Rectification, region: SearchRegion) -> NDArray[np.bool_]:
-        rows, columns = np.arange(STEP) + block.row, np.arange(STEP) + block.column
+        at = np.arange(block.step)
+        rows, columns = at + block.row, at + block.column
         grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
         return region.contains(self.camera_at(grid, trial))
 
@@ -370,11 +412,10 @@ class _MapSearch:
         return np.stack([east, north], axis=-1)
 
     def merge(self, scores: Scores, trial: int, found: BlockScores) -> None:
-        lead = (SIZE - STEP) // 2
         rows, columns = scores.best.shape
         for block, values in found.blocks:
-            r, c = block.row + lead, block.column + lead
-            h, w = min(STEP, rows - r), min(STEP, columns - c)
+            r, c = block.row + self.lead, block.column + self.lead
+            h, w = min(block.step, rows - r), min(block.step, columns - c)
             window = np.s_[r : r + h, c : c + w]
             weighed = values[:h, :w] / np.float32(found.noise)
             better = weighed > scores.best[window]
@@ -383,7 +424,6 @@ class _MapSearch:
 
     def candidates(self, scores: Scores, trials: list[BlockScores]) -> list[PlaceCandidate]:
         """The highest peaks, no two closer than `_SUPPRESSED_M`."""
-        lead = (SIZE - STEP) // 2
         best = scores.best.copy()
         reach = max(2, round(_SUPPRESSED_M / self.correlator.level.cell_m))
         found: list[PlaceCandidate] = []
@@ -393,7 +433,7 @@ class _MapSearch:
                 break
             chosen = trials[int(scores.trial[i, j])]
             trial, score = chosen.trial, float(best[i, j]) * chosen.noise
-            place = self.camera_at(np.array([i - lead, j - lead]), trial)
+            place = self.camera_at(np.array([i, j]) - self.lead, trial)
             pose = Pose(
                 with_heading(self.query.rotation, trial.heading_rad),
                 np.array([*place, self.query.height_m]),
@@ -403,9 +443,13 @@ class _MapSearch:
         return found
 
 
-def _resized(values: Float32, n: int) -> Float32:
-    """(m, m) or (m, m, K) to n cells a side."""
-    if values.shape[0] == n:
+def _fitted(values: Float32, of: Rectification, to: Rectification) -> Float32:
+    """(m, m) or (m, m, K) of one rectification, turned and scaled to another's."""
+    m, n = values.shape[0], to.cells
+    turn = math.degrees(to.heading_rad - of.heading_rad)
+    if m == n and turn == 0:
         return values
-    resized: Float32 = cv2.resize(values, (n, n), interpolation=cv2.INTER_LINEAR)
-    return resized
+    fit = cv2.getRotationMatrix2D(((m - 1) / 2, (m - 1) / 2), turn, n / m)
+    fit[:, 2] += (n - m) / 2
+    fitted: Float32 = cv2.warpAffine(values, fit, (n, n), flags=cv2.INTER_LINEAR)
+    return fitted

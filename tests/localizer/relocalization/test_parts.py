@@ -14,10 +14,18 @@ from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.relocalization.align import FrameShift, displacement
 from localizer.relocalization.config import RelocalizationConfig
-from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
+from localizer.relocalization.correlate import LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
-from localizer.relocalization.patch import rectify, with_heading
-from localizer.relocalization.search import above_roofs, ground_of, trial_heights
+from localizer.relocalization.patch import CameraFootprint, footprint, rectify, with_heading
+from localizer.relocalization.search import (
+    Rectification,
+    SearchView,
+    _fitted,
+    _MapSearch,
+    above_roofs,
+    ground_of,
+    trial_heights,
+)
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
 from localizer.render.topview import DOWN
@@ -31,6 +39,13 @@ CONFIG = RelocalizationConfig()
 def query(heading_sigma_rad=None, height_m=100.0, height_sigma_m=2.0):
     frame = Frame(np.zeros((120, 160, 3), np.uint8), 1, CAMERA, 0)
     return PlaceQuery(frame, DOWN, 0.01, heading_sigma_rad, height_m, height_sigma_m)
+
+
+def smooth(seed, side, channels=3):
+    """Features (channels, side, side) int8 as smooth as a network's."""
+    values = np.random.default_rng(seed).normal(size=(side, side, channels))
+    blurred = cv2.GaussianBlur(values, (0, 0), 1.5)
+    return np.rint(blurred * 30 / blurred.std()).clip(-127, 127).astype(np.int8).transpose(2, 0, 1)
 
 
 def level(features):
@@ -64,17 +79,17 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
 
 
 def test_scores_are_normalised_correlations():
-    rng = np.random.default_rng(0)
-    features = rng.integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    features = smooth(0, 288)
     n = 24
-    mask = (rng.random((n, n)) > 0.2).astype(np.float32)
-    patch = rng.normal(size=(n, n, 3)).astype(np.float32) * mask[..., None]
+    mask = np.ones((n, n), np.float32)
+    mask[:9, :14] = 0
+    patch = smooth(1, n).transpose(1, 2, 0) * mask[..., None]
     correlator = LevelCorrelator(level(features), 1 << 26)
     spectra = transform_patch(patch, mask)
     checked = 0
-    for block in correlator.blocks():
+    for block in correlator.blocks(n):
         scores = correlator.correlate(spectra, block)
-        for i, j in ((3, 5), (77, 120), (STEP - 1, 40)):
+        for i, j in ((3, 5), (50, 90), (77, 120), (block.step - 1, 40)):
             r, c = block.row + i, block.column + j
             if min(r, c) < 0 or max(r, c) + n > 288:
                 continue
@@ -88,15 +103,15 @@ def test_scores_are_normalised_correlations():
 
 
 def test_patches_and_blocks_together_score_as_each_pair_alone():
-    """More patches than are multiplied at once, not each with each block, in any order."""
+    """As many patches as are multiplied at once, not each with each block, in any order."""
     rng = np.random.default_rng(3)
-    correlator = LevelCorrelator(level(rng.integers(-60, 60, (3, 288, 288)).astype(np.int8)), 0)
+    correlator = LevelCorrelator(level(smooth(0, 288)), 0)
     patches = [
         transform_patch(rng.normal(size=(n, n, 3)).astype(np.float32), np.ones((n, n), np.float32))
-        for n in (16, 20, 24, 17, 31)
+        for n in (16, 20, 24, 17)
     ]
-    blocks = correlator.blocks()[:3]
-    pairs = [(4, blocks[2]), (0, blocks[0]), (3, blocks[0]), (4, blocks[1]), (1, blocks[2])]
+    blocks = correlator.blocks(24)[:3]
+    pairs = [(3, blocks[2]), (0, blocks[0]), (2, blocks[0]), (3, blocks[1]), (1, blocks[2])]
     together = correlator.correlate_all(patches, pairs)
     assert len(together) == len(pairs)
     for scores, (n, block) in zip(together, pairs, strict=True):
@@ -104,15 +119,15 @@ def test_patches_and_blocks_together_score_as_each_pair_alone():
         assert np.abs(scores).max() > 0.01
 
 
-def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
-    rng = np.random.default_rng(1)
-    features = rng.integers(-60, 60, (3, 320, 320)).astype(np.int8)
-    r, c, n = 150, 201, 40
+@pytest.mark.parametrize("n", [40, 64, 65, 96])
+def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else(n):
+    features = smooth(1, 320)
+    r, c = 150, 201
     cut = features[:, r : r + n, c : c + n].transpose(1, 2, 0).astype(np.float32) * 0.01
     correlator = LevelCorrelator(level(features), 0)  # no budget: nothing is kept
     spectra = transform_patch(cut, np.ones((n, n), np.float32))
     best = []
-    for block in correlator.blocks():
+    for block in correlator.blocks(n):
         scores = correlator.correlate(spectra, block)
         i, j = np.unravel_index(int(np.argmax(scores)), scores.shape)
         best.append((float(scores[i, j]), block.row + i, block.column + j))
@@ -124,20 +139,40 @@ def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
 
 def test_a_patch_of_which_nothing_is_seen_looks_like_no_place():
     """The search of a low, steep view ended with a division by zero."""
-    features = np.random.default_rng(2).integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    features = smooth(2, 288)
     correlator = LevelCorrelator(level(features), 0)
     unseen = transform_patch(np.zeros((16, 16, 3), np.float32), np.zeros((16, 16), np.float32))
-    for block in correlator.blocks():
+    for block in correlator.blocks(16):
         assert np.abs(correlator.correlate(unseen, block)).max() == 0
+
+
+def test_a_trials_noise_is_that_of_the_ground_it_was_compared_with():
+    """Where most of a block is beyond the map, it was low, and such scores outranked others."""
+    whole = level(smooth(8, 512))
+    strip = replace(whole, features=whole.features.copy(), ground=whole.ground.copy())
+    strip.features[:, :, 96:], strip.ground[:, 6:] = 0, np.nan
+    patch = transform_patch(smooth(9, 24).transpose(1, 2, 0) * 0.01, np.ones((24, 24), np.float32))
+
+    def noise(overview):
+        correlator, view = LevelCorrelator(overview, 0), SearchView(query().frame.image, CAMERA)
+        run = _MapSearch(
+            view, query(), correlator, None, CONFIG, CameraFootprint(np.zeros(2), 0.48),
+            np.array([100.0]), tuple(correlator.blocks(24)),
+        )  # fmt: skip
+        wanted = [(run.trial(0.0, 100.0), run.suited_at(0))]
+        (found,) = run.correlate([patch], wanted, lambda: False)
+        return found.noise
+
+    assert noise(strip) == pytest.approx(noise(whole), rel=0.15)
 
 
 def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
     """The least recently used would be the next one wanted: going round, nothing was ever found."""
-    features = np.random.default_rng(0).integers(-99, 99, (3, 512, 512)).astype(np.int8)
+    features = smooth(0, 512)
     one = LevelCorrelator(level(features), 1 << 40)
     patch = transform_patch(np.ones((16, 16, 3), np.float32), np.ones((16, 16), np.float32))
-    blocks = one.blocks()
-    size = 3 * 256 * 129 * 8 + 32 * 17 * 8
+    blocks = one.blocks(96)
+    size = 3 * 128 * 65 * 8 + 32 * 17 * 8
     made = []
     correlator = LevelCorrelator(level(features), 5 * size)
     transform = scipy.fft.rfft2
@@ -178,6 +213,41 @@ def test_rectified_ground_lies_where_it_is():
     north = centre[1] - (rows.mean() + 0.5 - 64) * 0.5
     np.testing.assert_allclose((east, north), spot, atol=0.8)
     assert patch.seen[int(rows[0]), int(columns[0])]
+
+
+def test_features_are_turned_counter_clockwise_about_their_middle_and_scaled():
+    values = np.random.default_rng(4).normal(size=(12, 12, 16)).astype(np.float32)
+    of = Rectification(0.3, 80.0, np.zeros(2), 12)
+    same, turned = (
+        _fitted(values, of, of),
+        _fitted(values, of, replace(of, heading_rad=0.3 + np.pi / 2)),
+    )
+    np.testing.assert_array_equal(same, values)
+    np.testing.assert_allclose(turned, np.rot90(values), atol=1e-5)
+    twice = np.kron(values[..., 0], np.ones((2, 2), np.float32))
+    back = _fitted(twice, replace(of, cells=24), replace(of, heading_rad=0.3 - np.pi / 2))
+    np.testing.assert_allclose(back, np.rot90(values[..., 0], -1), atol=1e-5)
+
+
+def test_a_turned_rectification_is_the_one_of_the_turned_heading():
+    """Of a slanting camera, whose footprint turns with the heading: both place the spot alike."""
+    image = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(120, 160, 3)), (0, 0), 5)
+    image = np.clip(128 + 300 * image, 0, 255).astype(np.uint8)
+    rotation = so3_exp((np.radians(20), 0, 0)) @ DOWN
+    seen = footprint(CAMERA, rotation, 1.0, 2.0)
+
+    def seen_at(heading):
+        c, s = np.cos(heading), np.sin(heading)
+        centre = 60.0 * np.array([[c, -s], [s, c]]) @ seen.centre
+        patch = rectify(image, CAMERA, with_heading(rotation, heading), 60.0, centre, 64, 1.5)
+        grey = patch.rgb.mean(axis=2).astype(np.float32) - 128
+        return grey * patch.seen, Rectification(heading, 60.0, centre, 64)
+
+    (first, of), (second, to) = seen_at(1.0), seen_at(1.0 + np.radians(9))
+    turned = _fitted(first, of, to)
+    assert np.corrcoef(turned.ravel(), second.ravel())[0, 1] > 0.95
+    assert np.corrcoef(first.ravel(), second.ravel())[0, 1] < 0.8
+    assert np.corrcoef(_fitted(first, to, of).ravel(), second.ravel())[0, 1] < 0.7
 
 
 def test_heights_cover_the_ground_and_its_error():
