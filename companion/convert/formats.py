@@ -27,9 +27,14 @@ from companion.trajectory import snapshot_name
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_quaternion, quaternion_from_matrix
-from localizer.geometry.posefile import pose_row, read_poses, world_from_camera, write_poses
+from localizer.geometry.posefile import (
+    pose_row,
+    read_poses,
+    text_lines,
+    world_from_camera,
+    write_poses,
+)
 from localizer.geometry.trajectory import StampedPose, read_tum, write_tum
-from localizer.plain_files import plain_text
 
 AUTOPILOT_COLUMNS = (
     "name", "time_ns", "latitude_deg", "longitude_deg", "height_m",
@@ -97,7 +102,7 @@ def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
         )
     poses: list[StampedPose] = []
     counted, points_follow = None, False
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(text_lines(path), start=1):
         if line.startswith("#"):
             counted = _COUNTED.match(line) or counted
         elif points_follow and _are_points(line):
@@ -149,7 +154,7 @@ def _write_colmap(path: Path, poses: Sequence[StampedPose], place: MapReference)
 def _read_autopilot(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     poses = []
     try:
-        rows = list(csv.DictReader(_lines(path)))
+        rows = list(csv.DictReader(text_lines(path)))
     except csv.Error as error:
         raise PoseFileError(f"{path}: not a table: {error}") from error
     for number, row in enumerate(rows, start=2):
@@ -221,13 +226,6 @@ def _read_photos(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
 
 def _write_photos(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
     write_sidecars(path, poses, place.frame, place.heights)
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return plain_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
 
 
 READERS: dict[str, Reader] = {

@@ -40,13 +40,9 @@ def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
     `PoseFileError` if the file cannot be read, a line is malformed, a name is repeated, or there is
     no pose.
     """
-    try:
-        lines = plain_text(Path(path)).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
     rows = [
         _parse(line, f"{path}:{number}")
-        for number, line in enumerate(lines, start=1)
+        for number, line in enumerate(text_lines(Path(path)), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not rows:
@@ -55,6 +51,14 @@ def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
     if count > 1:
         raise PoseFileError(f"{path}: {count} lines are of {name}; leave the right one")
     return tuple(rows)
+
+
+def text_lines(path: Path) -> list[str]:
+    """The lines of a file of poses; `PoseFileError` if it cannot be read."""
+    try:
+        return plain_text(path).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PoseFileError(f"{path}: cannot be read: {error}") from error
 
 
 def _parse(line: str, where: str) -> PoseRow:

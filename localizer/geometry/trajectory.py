@@ -15,7 +15,7 @@ import numpy as np
 
 from localizer.errors import PoseFileError
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, quaternion_from_matrix
-from localizer.plain_files import plain_text
+from localizer.geometry.posefile import text_lines
 
 _TUM_FIELDS = "time x y z qx qy qz qw"
 COVARIANCE_COLUMNS = (
@@ -64,13 +64,9 @@ def read_tum(path: Path) -> tuple[StampedPose, ...]:
     that begin with # are skipped. `PoseFileError` if the file cannot be read, a line is malformed,
     or there is no pose.
     """
-    try:
-        lines = plain_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
     poses = tuple(
         _parse_tum(line, f"{path}:{number}")
-        for number, line in enumerate(lines, start=1)
+        for number, line in enumerate(text_lines(path), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     )
     if not poses:
