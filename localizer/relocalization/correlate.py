@@ -12,6 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -212,7 +213,7 @@ class LevelCorrelator:
         )
 
 
-def _low(spectra: Complex64) -> Complex64:
+def _low(spectra: NDArray[Any]) -> Complex64:
     """The low frequencies (K, 2 _LOW, _LOW+1) of spectra (K, SIZE, at least _LOW+1)."""
     kept = [spectra[:, :_LOW, : _LOW + 1], spectra[:, -_LOW:, : _LOW + 1]]
     return np.concatenate(kept, axis=1).astype(np.complex64, copy=False)
