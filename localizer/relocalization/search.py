@@ -242,6 +242,8 @@ class SuitedOrigins:
 class _MapSearch:
     """Data of one search. blocks: of the map; suited: for each height, the blocks with an origin
     that it suits.
+
+    Above 200 lines: one correlation, from a heading's patch to the scores of all blocks.
     """
 
     view: SearchView
@@ -283,7 +285,7 @@ class _MapSearch:
         for first in range(0, len(wanted), PATCHES_TOGETHER):
             some = wanted[first : first + PATCHES_TOGETHER]
             patches = [
-                transform_patch(*(_fitted(x, middle, trial) for x in (features, mask)))
+                transform_patch(*(resampled(x, middle, trial) for x in (features, mask)))
                 for trial, _ in some
             ]
             scores = self.correlate(patches, some, should_stop)
@@ -443,8 +445,10 @@ class _MapSearch:
         return found
 
 
-def _fitted(values: Float32, of: Rectification, to: Rectification) -> Float32:
-    """(m, m) or (m, m, K) of one rectification, turned and scaled to another's."""
+def resampled(values: Float32, of: Rectification, to: Rectification) -> Float32:
+    """Values (m, m) or (m, m, K) of one rectification on the cells of another: (n, n) or (n, n, K),
+    turned and scaled, interpolated; `values` itself if nothing changes.
+    """
     m, n = values.shape[0], to.cells
     turn = math.degrees(to.heading_rad - of.heading_rad)
     if m == n and turn == 0:

@@ -20,10 +20,10 @@ from localizer.relocalization.patch import CameraFootprint, footprint, rectify, 
 from localizer.relocalization.search import (
     Rectification,
     SearchView,
-    _fitted,
     _MapSearch,
     above_roofs,
     ground_of,
+    resampled,
     trial_heights,
 )
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
@@ -220,13 +220,13 @@ def test_features_are_turned_counter_clockwise_about_their_middle_and_scaled():
     values = np.random.default_rng(4).normal(size=(12, 12, 16)).astype(np.float32)
     of = Rectification(0.3, 80.0, np.zeros(2), 12)
     same, turned = (
-        _fitted(values, of, of),
-        _fitted(values, of, replace(of, heading_rad=0.3 + np.pi / 2)),
+        resampled(values, of, of),
+        resampled(values, of, replace(of, heading_rad=0.3 + np.pi / 2)),
     )
     np.testing.assert_array_equal(same, values)
     np.testing.assert_allclose(turned, np.rot90(values), atol=1e-5)
     twice = np.kron(values[..., 0], np.ones((2, 2), np.float32))
-    back = _fitted(twice, replace(of, cells=24), replace(of, heading_rad=0.3 - np.pi / 2))
+    back = resampled(twice, replace(of, cells=24), replace(of, heading_rad=0.3 - np.pi / 2))
     np.testing.assert_allclose(back, np.rot90(values[..., 0], -1), atol=1e-5)
 
 
@@ -245,10 +245,10 @@ def test_a_turned_rectification_is_the_one_of_the_turned_heading():
         return grey * patch.seen, Rectification(heading, 60.0, centre, 64)
 
     (first, of), (second, to) = seen_at(1.0), seen_at(1.0 + np.radians(9))
-    turned = _fitted(first, of, to)
+    turned = resampled(first, of, to)
     assert np.corrcoef(turned.ravel(), second.ravel())[0, 1] > 0.95
     assert np.corrcoef(first.ravel(), second.ravel())[0, 1] < 0.8
-    assert np.corrcoef(_fitted(first, to, of).ravel(), second.ravel())[0, 1] < 0.7
+    assert np.corrcoef(resampled(first, to, of).ravel(), second.ravel())[0, 1] < 0.7
 
 
 def test_heights_cover_the_ground_and_its_error():
