@@ -29,9 +29,10 @@ For the pilot and the operator: every text that the companion sends. Made from t
 `python -m benchmarks.site`; do not edit.
 
 An alert is sent as STATUSTEXT `{PREFIX}TEXT`. Left: its text, its identifier in `events.csv` and
-`health.json`, and the severity *error* or *critical* (others: warning or less). Right: its cause,
-end, meaning and effect, and in bold what to do. In a text, N is a number; other capitals are a
-name, a number or a reason. `bridge.origin` and the like are keys of the deployment file.
+`health.json`, and the severity *error* or *critical* (others: warning or less). Right: its cause
+and end, in italics its meaning and effect, in bold what to do. In a text, N is a number; other
+capitals are a name, a number or a reason. `bridge.origin` and the like are keys of the deployment
+file.
 
 **Fixes:** an alert stops fixes only if its text begins with *output held* or *not sent*, or its row
 says *no fixes*.
@@ -91,7 +92,7 @@ Without GNSS and without fixes, ArduPilot lands after 5 to 8 s
 _TABLE = """
 ## {}
 
-| text | raised, ends, meaning, **what to do** |
+| text | raised, ends, *meaning*, **what to do** |
 |---|---|
 """
 _GROUPS = {
@@ -122,7 +123,7 @@ def _row(spec: AlertSpec) -> str:
     if spec.cleared not in ("", WHILE):
         text = f" (`{spec.cleared_text}`)" if spec.cleared_text else ""
         lines.append(f"*Ends:* {spec.cleared}{text}")
-    lines.append(f"*Means:* {spec.meaning}")
+    lines.append(f"<i>{spec.meaning}</i>")
     if spec.operator != NOTHING:
         lines.append(f"**{spec.operator}**")
     marks = (

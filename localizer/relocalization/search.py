@@ -243,7 +243,8 @@ class _MapSearch:
     """Data of one search. blocks: of the map; suited: for each height, the blocks with an origin
     that it suits.
 
-    Above 200 lines: one correlation, from a heading's patch to the scores of all blocks.
+    Above 200 lines and 15 public methods: one correlation, from a heading's patch to the scores of
+    all blocks.
     """
 
     view: SearchView

@@ -61,8 +61,7 @@ class _Pose:
 class Tracker:
     """Tests registrations, filters the motion, and propagates the pose without the map.
 
-    `update` belongs to the localization thread; other methods may be called from any thread.
-    dead_reckoning: None: without odometry.
+    `update`: localization thread; others: any thread. dead_reckoning: None without odometry.
     """
 
     def __init__(

@@ -164,7 +164,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           {"system": "id", "why": SenderRefusal},
           "a fourth system (N) sends a command that it may not; further ones are not reported "
           "until a restart",
-          "their commands are denied", "as for `sender_refused`"),
+          "their commands are denied",
+          "add yours to `bridge.ground_systems`, or sign their links"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
           "the ground station gives the position; N: its sigma, at least 10 m, without one 100 m",
           "searches of the next 2 min look within 2 N", NOTHING),
