@@ -12,6 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -73,15 +74,14 @@ class PatchSpectra:
 def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
     """Transform a patch. features: (n, n, K) weighted; mask: (n, n) in [0, 1]."""
     n = features.shape[0]
-    # Every second cell has the low frequencies. Row by row first: most rows are empty and stay so.
-    few = 4 * features[::2, ::2].transpose(2, 0, 1)
-    lines = scipy.fft.rfft(few, 2 * _LOW, axis=2, workers=1)
-    spectra = scipy.fft.fft(lines, 2 * _LOW, axis=1, workers=1)
+    # Row by row first: most rows are empty and stay so.
+    lines = scipy.fft.rfft(features.transpose(2, 0, 1), SIZE, axis=2, workers=1)
+    spectra = scipy.fft.fft(lines[:, :, : _LOW + 1], SIZE, axis=1, workers=1)
     sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
     coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)
     norm = float(np.sqrt((features**2).sum()))
     return PatchSpectra(
-        np.ascontiguousarray(spectra, np.complex64),
+        _low(spectra),
         np.ascontiguousarray(coarse, np.complex64),
         norm,
         n,
@@ -213,7 +213,7 @@ class LevelCorrelator:
         )
 
 
-def _low(spectra: Complex64) -> Complex64:
+def _low(spectra: NDArray[Any]) -> Complex64:
     """The low frequencies (K, 2 _LOW, _LOW+1) of spectra (K, SIZE, at least _LOW+1)."""
     kept = [spectra[:, :_LOW, : _LOW + 1], spectra[:, -_LOW:, : _LOW + 1]]
     return np.concatenate(kept, axis=1).astype(np.complex64, copy=False)

@@ -286,16 +286,16 @@ class _MapSearch:
         for first in range(0, len(wanted), PATCHES_TOGETHER):
             some = wanted[first : first + PATCHES_TOGETHER]
             patches = [
-                transform_patch(*(resampled(x, middle, trial) for x in (features, mask)))
+                transform_patch(*(fitted(x, middle, trial) for x in (features, mask)))
                 for trial, _ in some
             ]
-            scores = self.correlate(patches, some, should_stop)
+            scores = self._correlate(patches, some, should_stop)
             if scores is None:
                 return None
             found += scores
         return found
 
-    def correlate(
+    def _correlate(
         self,
         patches: list[PatchSpectra],
         wanted: list[tuple[Rectification, dict[Block, SuitedOrigins]]],
@@ -363,12 +363,8 @@ class _MapSearch:
     def suited_at(self, scale: int) -> dict[Block, SuitedOrigins]:
         """The blocks with an origin that suits the height `heights[scale]`, at any heading."""
         cells = self.cells(float(self.heights[scale]))
-        ground = {b: self.ground(b, cells) for b in self.blocks}
-        origins = {
-            b: SuitedOrigins(self.suits(below, scale), float(np.isfinite(below).mean()))
-            for b, below in ground.items()
-        }
-        return {b: o for b, o in origins.items() if o.mask.any()}
+        origins = {b: self.suits(self.ground(b, cells), scale) for b in self.blocks}
+        return {b: suited for b, suited in origins.items() if suited.mask.any()}
 
     def ground(self, block: Block, cells: int) -> Float32:
         """Ground heights below the centres of patches of this many cells, every `GROUND_CELLS`."""
@@ -380,15 +376,16 @@ class _MapSearch:
         out = ((i < 0) | (i >= ground.shape[0]))[:, None] | ((j < 0) | (j >= ground.shape[1]))
         return np.where(out, np.nan, ground[inside]).astype(np.float32)
 
-    def suits(self, ground: Float32, scale: int) -> NDArray[np.bool_]:
-        """Mask of the ground heights at which the scale fits the query's height, with its error."""
+    def suits(self, ground: Float32, scale: int) -> SuitedOrigins:
+        """Where the scale fits the query's height, with its error. ground: heights."""
         reach = math.sqrt(self.config.scale_step)
         above = self.query.height_m - ground
         sigma = self.query.height_sigma_m
         low = np.maximum(above - sigma, _LEAST_HEIGHT_M) / reach
         high = np.maximum(above + sigma, _LEAST_HEIGHT_M) * reach
         height = self.heights[scale]
-        return np.asarray((low <= height) & (height <= high))
+        mask = np.asarray((low <= height) & (height <= high))
+        return SuitedOrigins(mask, float(np.isfinite(ground).mean()))
 
     def masked(
         self, scores: Float32, block: Block, trial: Rectification, suits: NDArray[np.bool_]
@@ -446,10 +443,8 @@ class _MapSearch:
         return found
 
 
-def resampled(values: Float32, of: Rectification, to: Rectification) -> Float32:
-    """Values (m, m) or (m, m, K) of one rectification on the cells of another: (n, n) or (n, n, K),
-    turned and scaled, interpolated; `values` itself if nothing changes.
-    """
+def fitted(values: Float32, of: Rectification, to: Rectification) -> Float32:
+    """(m, m) or (m, m, K) of one rectification, turned and scaled to another's."""
     m, n = values.shape[0], to.cells
     turn = math.degrees(to.heading_rad - of.heading_rad)
     if m == n and turn == 0:

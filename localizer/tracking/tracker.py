@@ -30,21 +30,10 @@ from localizer.types import (
 
 @dataclass(frozen=True)
 class TrackerState:
-    """State of both threads; immutable, replaced as one object. motion: None without a prior.
-    map_covariance: (6, 6) of the last accepted registration, None while bridging or without one.
-    """
+    """State of both threads; immutable, replaced as one object. motion: None without a prior."""
 
     motion: MotionState | None = None
     track_status: TrackStatus = field(default_factory=TrackStatus)
-    map_covariance: Array | None = None
-
-    def with_map_error(self, prior: PosePrior) -> PosePrior:
-        """A prediction with the error of the last registration. The map's errors stay alike for
-        seconds, so the motion filter's covariance does not contain them.
-        """
-        if self.map_covariance is None:
-            return prior
-        return replace(prior, covariance=prior.covariance + self.map_covariance)
 
 
 @dataclass(frozen=True)
@@ -61,7 +50,8 @@ class _Pose:
 class Tracker:
     """Tests registrations, filters the motion, and propagates the pose without the map.
 
-    `update`: localization thread; others: any thread. dead_reckoning: None without odometry.
+    `update` belongs to the localization thread; other methods may be called from any thread.
+    dead_reckoning: None: without odometry.
     """
 
     def __init__(
@@ -132,13 +122,11 @@ class Tracker:
         query: the frame's features. anchors, fused: None without a reference view.
         """
         result = None if fused is None else fused.registration
-        acceptable = result is not None and self._is_acceptable(result, seen, ahead.prior)
+        acceptable = result is not None and self._is_acceptable(result, ahead.prior)
         if fused is not None and fused.contradicted and seen.track_status.tentative:
             acceptable = False  # gravity and height are evidence that the search did not use
         carried = self._carry(seen, ahead, frame, query, anchors, acceptable)
         rejoins = not acceptable and self._rejoins(seen.track_status, result, carried, frame)
-        if acceptable and result is not None:  # it refutes the motion, not the registrations before
-            rejoins = self._distance(result, ahead.prior) > self._config.integrity.chi2_threshold
         acceptable = acceptable or rejoins
         if result is not None:
             measured, covariance = result.world_from_camera, result.covariance
@@ -156,7 +144,7 @@ class Tracker:
         moved = self._next_motion(ahead, result, acceptable and not bridges, carried, lost)
         if rejoins and not bridges and result is not None:  # the prediction was of the wrong place
             moved = motion.start(_restart(result, ahead), self._config.motion)
-        self._store(seen, moved, track_status, covariance if acceptable and not bridges else None)
+        self._store(seen, moved, track_status)
         given, usable = _given(outcome, result, carried, track_status)
         if usable and not bridges:
             # Position and tilt err together, from frame to frame again; the turn between two frames
@@ -174,15 +162,11 @@ class Tracker:
             self._dead_reckoning.begin(estimate, query, anchors, moved.velocity, swept)
         return estimate
 
-    def _is_acceptable(self, result: Registration, seen: TrackerState, prior: PosePrior) -> bool:
+    def _is_acceptable(self, result: Registration, prior: PosePrior) -> bool:
         # Also before tracking: the gate is against the prior's own covariance, which is wide then.
-        distance = self._distance(result, seen.with_map_error(prior))
+        distance = prior.mahalanobis_squared(result.world_from_camera, result.covariance)
         sigma_m = motion.horizontal_sigma_m(prior)
         return is_acceptable(self._config.integrity, result, distance, sigma_m)
-
-    @staticmethod
-    def _distance(result: Registration, prior: PosePrior) -> float:
-        return prior.mahalanobis_squared(result.world_from_camera, result.covariance)
 
     def _carry(
         self, seen: TrackerState, ahead: MotionState, frame: Frame, query: FeaturePyramid,
@@ -246,18 +230,11 @@ class Tracker:
             return motion.reset_motion(ahead, ahead.time_ns, self._config.motion, None)
         return ahead
 
-    def _store(
-        self, seen: TrackerState, state: MotionState, track_status: TrackStatus,
-        accepted: Array | None,
-    ) -> None:  # fmt: skip
-        """Store the new state unless an external prior replaced it meanwhile. accepted: covariance
-        of an accepted registration.
-        """
-        keeps = track_status.state in (TrackingState.TRACKING, TrackingState.DEGRADED)
-        kept = accepted if accepted is not None else seen.map_covariance if keeps else None
+    def _store(self, seen: TrackerState, state: MotionState, track_status: TrackStatus) -> None:
+        """Store the new state unless an external prior replaced it meanwhile."""
         with self._lock:
             if self._state is seen:
-                self._state = TrackerState(state, track_status, kept)
+                self._state = TrackerState(state, track_status)
 
 
 def _restart(result: Registration, ahead: MotionState) -> PosePrior:
