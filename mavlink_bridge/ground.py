@@ -43,7 +43,7 @@ class GroundEnd:
         link.system_id = config.system_id or state.system_id or 0
         self._shared.watch.check(state)
         if link.stranger:
-            self._notifier.notify(
+            self._notifier.notify_each(
                 "foreign", alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
             )
         if link.system_id:

@@ -73,9 +73,12 @@ class OperatorStatus:
                 alert for alert in alerts
                 if alert.key not in self._last_reported and self._is_due(alert, now_ns, bad=bad)
             ]  # fmt: skip
-            if due or not bad:
-                self._last_reported = keys
-                self._reported_ns |= {alert.key: now_ns for alert in due}
+            sent = {alert.key for alert in due}
+            # An alert that is not active any more is news when it comes back.
+            self._last_reported = tuple(
+                key for key in keys if not bad or key in sent or key in self._last_reported
+            )
+            self._reported_ns |= dict.fromkeys(sent, now_ns)
         if tell:
             for alert in due:
                 self.report(alert, now_ns)

@@ -51,6 +51,7 @@ class StatusNotifier:
         self._reported: dict[str, Alert | None] = dict(known or {})
         self._settling: dict[str, Hysteresis] = {}
         self._since_relief: dict[str, set[AlertKey]] = {}
+        self._each: dict[str, set[AlertKey]] = {}
 
     def reported(self, topic: str) -> Alert | None:
         """The last problem or relief of a topic; None before the first, or if it ended without."""
@@ -72,6 +73,13 @@ class StatusNotifier:
         self._reported[topic] = news
         if news is not None and (problem is not None or is_known):
             self.report(news)
+
+    def notify_each(self, topic: str, problem: Alert, most: int = 4) -> None:
+        """Report each problem of a topic once, and `most` of them: a forger may use many names."""
+        reported = self._each.setdefault(topic, set())
+        if problem.key not in reported and len(reported) < most:
+            reported.add(problem.key)
+            self.report(problem)
 
     def notify_settled(
         self,

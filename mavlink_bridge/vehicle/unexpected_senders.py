@@ -59,7 +59,7 @@ class UnexpectedSenderMonitor:
         """Detect other hosts and gimbals, false clocks, forged arming, duplicate ids."""
         if link.stranger:
             ignored = alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
-            self._notifier.notify("foreign", ignored)
+            self._notifier.notify_each("foreign", ignored)
         others = self._tracker.other_gimbals
         if others and not self._config.camera.gimbal_component:
             component, device = others[0]

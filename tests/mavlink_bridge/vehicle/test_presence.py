@@ -234,3 +234,14 @@ def test_a_worse_state_is_told_at_once_and_an_older_one_again_after_a_while() ->
     for at_s, (level, of) in steps:
         status.set_health(level, [alert(of)], tell=True, now_ns=at_s * 10**9)
     assert [a.id for a in told] == [AlertId.DEGRADED, AlertId.NO_FRAME] * 2  # at 0, 1, 12 and 13 s
+
+
+def test_a_loss_that_returns_is_reported_beside_an_alert_that_stays() -> None:
+    """While the search hangs, only the first of five losses was sent."""
+    told: list[Alert] = []
+    status = OperatorStatus(lambda *_: None, told.append)
+    hangs, lost = alert(AlertId.SEARCH_HANGS), alert(AlertId.NO_FRAME)
+    for at_s in range(0, 300, 60):
+        status.set_health(HealthLevel.FAILED, [lost, hangs], tell=True, now_ns=at_s * 10**9)
+        status.set_health(HealthLevel.DEGRADED, [hangs], tell=True, now_ns=(at_s + 30) * 10**9)
+    assert told == [lost, hangs, *[lost] * 4]

@@ -397,6 +397,22 @@ def test_the_angles_of_two_gimbals_are_not_mixed(other: tuple[int, int]) -> None
     assert told == [alert(AlertId.GIMBAL_IGNORED, component=other[0], device=other[1])]
 
 
+def test_foreign_senders_in_turn_do_not_flood_the_ground_station() -> None:
+    """Two of them made 100 texts in 10 s: whoever was not the last one was news."""
+    told: list[Alert] = []
+    watch = UnexpectedSenderMonitor(
+        BridgeConfig(), tracker(), StatusNotifier(told.append), Counter()
+    )
+    for k in range(100):
+        link: Any = SimpleNamespace(stranger=f"127.0.0.{2 + k % 2}", system_id=1)
+        watch.check(link, 20 * SECOND)
+    assert len(told) == 2
+    for k in range(100):  # a forger has many names
+        link = SimpleNamespace(stranger=f"127.0.1.{k}", system_id=1)
+        watch.check(link, 20 * SECOND)
+    assert len(told) == 4
+
+
 def test_the_configured_gimbal_counts_whoever_spoke_first() -> None:
     it = VehicleTracker(None, LEVEL, False, (0, 2))
     it.handle(sent(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)), SECOND)
