@@ -79,7 +79,8 @@ ALT_HOLD or STABILIZE (PX4: Altitude, Stabilized), which need no position, and l
 show; if it is wrong, take over |
 | give the position | send the approximate position: *I am here* in the console, or \
 MAV_CMD_EXTERNAL_POSITION_ESTIMATE to component 197. It limits the search, and is never a fix |
-| in flight | armed, and 3 m or more from the take-off height; otherwise the alert ends |
+| armed:, in flight: | otherwise the alert ends. *In flight*: armed, and 3 m or more from the \
+take-off height |
 | sigma | one standard deviation of the judged value |
 | protection level | radius that the position error exceeds in at most 0.1 % of fixes \
 (`integrity_monitor.protection.risk`) |

@@ -34,9 +34,9 @@ _CONVERGED = 1e-3  # of a sigma
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of the least-squares solution. guess: the most probable values and poses. covariance:
-    (COUNT, COUNT) of the shared values, with the weak priors; information: of the shared values,
-    from the flight alone. pixel_sigma: sigma of a patch, px.
+    """Result of the least-squares solution. guess: the most probable corrections
+    and poses. covariance: (COUNT, COUNT) of the corrections, with the weak priors; information: of
+    them, from the flight alone. pixel_sigma: sigma of a patch, px.
     """
 
     guess: Guess
@@ -58,78 +58,79 @@ class _Noise:
 
 
 def solve(
-    evidence: CalibrationProblem, fixed: NDArray[np.bool_] | None = None, sigmas: Array = u.SIGMAS
+    problem: CalibrationProblem, fixed: NDArray[np.bool_] | None = None, sigmas: Array = u.SIGMAS
 ) -> Solution:
-    """Estimate the values. fixed: (COUNT,) bool, True keeps the value, None: none; sigmas: (COUNT,)
-    of the weak priors.
+    """Estimate `UNKNOWNS`, corrections of the deployment's values, and every frame's pose. fixed:
+    (COUNT,) bool, True keeps a correction at 0, None: none; sigmas: (COUNT,) of the weak priors,
+    whose means are 0.
     """
-    guess = evidence.start
+    guess = problem.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
     prior: Array = 1.0 / sigmas**2 * np.where(still, 1e12, 1.0)
     up = guess.rotations[:, 2]
     attitude = AttitudeProcess(np.full(5, _FIRST["attitudes"]), _FIRST_MEMORY_S, up)
     place = GaussMarkovProcess(np.full(3, _FIRST["places"]), np.full(3, _FIRST_MEMORY_S))
-    noise = _Noise(1.0, np.ones(len(evidence.owner)), attitude, place)
+    noise = _Noise(1.0, np.ones(len(problem.owner)), attitude, place)
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
-            H, g = _normal(evidence, guess, noise, prior)
+            H, g = _normal(problem, guess, noise, prior)
             factor = cho_factor(H, lower=True, check_finite=False)
             step = -cho_solve(factor, g, check_finite=False)
             frames = step[u.COUNT :].reshape(-1, 6)
             guess = guess.stepped(step[: u.COUNT], frames)
             if np.abs(step[: u.COUNT] / u.USEFUL).max() < _CONVERGED:
                 break
-        noise = _noise(evidence, guess, noise)
-    noise = _with_long_term_errors(evidence, guess, noise)
-    H, _ = _normal(evidence, guess, noise, prior)
+        noise = _noise(problem, guess, noise)
+    noise = _with_long_term_errors(problem, guess, noise)
+    H, _ = _normal(problem, guess, noise, prior)
     shared = np.eye(len(H), u.COUNT)
     gain: Array = cho_solve(cho_factor(H, lower=True), shared).T
-    pictures = _pictures(evidence, guess, noise)
-    alone, larger = images_covariance(gain, u.COUNT, pictures, evidence.grounds)
+    pictures = _pictures(problem, guess, noise)
+    alone, larger = images_covariance(gain, u.COUNT, pictures, problem.grounds)
     P = gain[:, : u.COUNT] + alone * (np.outer(larger, larger) - 1.0)
     P = 0.5 * (P + P.T)
     information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(prior)
     return Solution(guess, P, information, noise.pixel_sigma, noise.attitude, noise.place)
 
 
-def _noise(evidence: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise:
-    off = evidence.pixel_residuals(guess)
+def _noise(problem: CalibrationProblem, guess: Guess, before: _Noise) -> _Noise:
+    off = problem.pixel_residuals(guess)
     squares = (off**2).sum(axis=1)
     sigma = float(np.sqrt(np.median(squares) / (2.0 * np.log(2.0))))
     weight = 1.0 / (1.0 + squares / (_CAUCHY * sigma) ** 2)
     attitude = AttitudeProcess.of(
-        evidence.attitude_residuals(guess), guess.rotations[:, 2], evidence.times_s,
+        problem.attitude_residuals(guess), guess.rotations[:, 2], problem.times_s,
         _LEAST["attitudes"], _WHITE["attitudes"],
     )  # fmt: skip
-    place, placed = before.place, evidence.placed
+    place, placed = before.place, problem.placed
     if placed.any():
-        left = evidence.place_residuals(guess)[placed]
-        place = GaussMarkovProcess.of(left, evidence.times_s[placed], _LEAST["places"])
+        left = problem.place_residuals(guess)[placed]
+        place = GaussMarkovProcess.of(left, problem.times_s[placed], _LEAST["places"])
     return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
 
 
-def _with_long_term_errors(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> _Noise:
+def _with_long_term_errors(problem: CalibrationProblem, guess: Guess, noise: _Noise) -> _Noise:
     """Noise whose position errors are those over minutes, for the reported covariance."""
-    placed = evidence.placed
+    placed = problem.placed
     if not placed.any():
         return noise
-    left = evidence.place_residuals(guess)[placed]
-    return replace(noise, place=noise.place.over_long_steps(left, evidence.times_s[placed]))
+    left = problem.place_residuals(guess)[placed]
+    return replace(noise, place=noise.place.over_long_steps(left, problem.times_s[placed]))
 
 
 def _normal(
-    evidence: CalibrationProblem, guess: Guess, noise: _Noise, prior: Array
+    problem: CalibrationProblem, guess: Guess, noise: _Noise, prior: Array
 ) -> tuple[Array, Array]:
     """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,). prior: (COUNT,)
     information of the weak priors; very large for a fixed value.
     """
-    K = len(evidence.times_s)
+    K = len(problem.times_s)
     M = u.COUNT + 6 * K
     H, g = np.zeros((M, M)), np.zeros(M)
-    _add_pictures(_pictures(evidence, guess, noise), H, g)
-    _add_wander(evidence.attitude_residuals, "attitudes", noise.attitude, evidence, guess, H, g)
-    if evidence.placed.any():
-        _add_wander(evidence.place_residuals, "places", noise.place, evidence, guess, H, g)
+    _add_pictures(_pictures(problem, guess, noise), H, g)
+    _add_wander(problem.attitude_residuals, "attitudes", noise.attitude, problem, guess, H, g)
+    if problem.placed.any():
+        _add_wander(problem.place_residuals, "places", noise.place, problem, guess, H, g)
     H[range(u.COUNT), range(u.COUNT)] += prior
     g[: u.COUNT] += prior * guess.shared
     H[range(u.COUNT, M), range(u.COUNT, M)] += 1e-9
@@ -158,12 +159,12 @@ def _derivatives(
     return value, by_frame, by_shared
 
 
-def _pictures(evidence: CalibrationProblem, guess: Guess, noise: _Noise) -> ImageNormalEquations:
+def _pictures(problem: CalibrationProblem, guess: Guess, noise: _Noise) -> ImageNormalEquations:
     optics = range(*u.OPTICS.indices(u.COUNT))
-    value, by_frame, by_shared = _derivatives(evidence.pixel_residuals, guess, optics)
+    value, by_frame, by_shared = _derivatives(problem.pixel_residuals, guess, optics)
     weight = noise.weight / (noise.pixel_sigma**2 * _ALIKE)
     by_optics = by_shared[..., u.OPTICS]
-    return ImageNormalEquations.of(evidence.owner, weight, value, by_frame, by_optics)
+    return ImageNormalEquations.of(problem.owner, weight, value, by_frame, by_optics)
 
 
 def _add_pictures(pictures: ImageNormalEquations, H: Array, g: Array) -> None:
@@ -180,13 +181,13 @@ def _add_pictures(pictures: ImageNormalEquations, H: Array, g: Array) -> None:
 
 def _add_wander(
     function: Callable[[Guess], Array], name: str, wander: GaussMarkovProcess | AttitudeProcess,
-    evidence: CalibrationProblem, guess: Guess, H: Array, g: Array,
+    problem: CalibrationProblem, guess: Guess, H: Array, g: Array,
 ) -> None:  # fmt: skip
     """Add the autopilot's residuals, whitened by their error process, to H and g."""
-    used = evidence.placed if name == "places" else np.ones(len(guess.places), bool)
+    used = problem.placed if name == "places" else np.ones(len(guess.places), bool)
     value, by_frame, by_shared = _derivatives(function, guess, range(u.LATE, u.COUNT))
     which = np.flatnonzero(used)
-    times_s, S = evidence.times_s[which], u.COUNT
+    times_s, S = problem.times_s[which], u.COUNT
     J = np.zeros((len(which), 3, len(g) + 1))
     for i, k in enumerate(which):
         J[i, :, S + 6 * k : S + 6 * k + 6] = by_frame[k]

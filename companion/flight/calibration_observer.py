@@ -27,7 +27,8 @@ class CalibrationObserver:
 
     def add_fix(self, estimate: PoseEstimate, bundle: ReferenceBundle, fix: VisionFix) -> None:
         """Pass on a registration against the map, at most one in 0.25 s; ignored unless TRACKING
-        and with the map in the middle of `bundle`'s view. Never blocks. fix: of this estimate.
+        and with the map in the middle of `bundle`'s view. Waits only for `take`. fix: of this
+        estimate, before the checks, which may have held it.
         """
         time_ns = estimate.exposure_time_ns
         if estimate.state is not TrackingState.TRACKING or time_ns < self._next_ns:

@@ -81,7 +81,8 @@ class FixInjection:
 
     def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
         """Convert an estimate, inject the fix if all checks pass, call observers. Others than
-        accepted ones, TRACKING or BRIDGING, only count as jumps. Never blocks.
+        accepted ones, TRACKING or BRIDGING, only count as jumps. Waits only for checks and
+        observers, for 1 s at most if the integrity monitor is busy.
         """
         self._jumps.add_state(estimate.state)
         if not is_for_injection(estimate):

@@ -87,7 +87,7 @@ def read_numbers(path: Path) -> dict[str, Any]:
 
 def camera_numbers(data: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments of `Camera`, from the keys of this project or another program (module
-    docstring). ValueError or TypeError for invalid data.
+    docstring). ValueError, TypeError or OverflowError for invalid data.
     """
     flat = _flat(data)
     forms = _forms(flat)

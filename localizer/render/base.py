@@ -120,7 +120,9 @@ class TileRenderer(ABC):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw exactly these meshes."""
+        """Draw exactly these meshes, also those out of view. camera: an ideal pinhole; only
+        `render` checks that.
+        """
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
         """See `MapRenderer.prefetch`."""

@@ -21,8 +21,9 @@ INJECTION: tuple[AlertSpec, ...] = (
           "injection starts, or a *not sent* alert has ended",
           "the autopilot receives fixes", NOTHING),
     condition(A.NO_FIX_YET, WARNING, "no fix yet", {},
-              "there was no fix yet; no text, only `inject_reason` in health.json",
-              WHILE, "vision has not found a position", _TAKE_OVER, lead=_NOT_SENT),
+              "no fix has passed the checks yet; no text, only `inject_reason` in health.json",
+              WHILE, "vision has found no position, or its fixes are held", _TAKE_OVER,
+              lead=_NOT_SENT),
     condition(A.NO_FRESH_FIX, WARNING, "no fresh fix", {},
               "nothing was sent for 1 s: the newest checked fix is older than "
               "`bridge.injection.delay_ms` + 0.5 s, or none came for twice the usual interval",

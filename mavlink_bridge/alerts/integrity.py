@@ -60,9 +60,9 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               "position step {metres:.0f} m, unexplained", {"metres": "m"},
               "the mean of five fixes is off that of the five before by more than 1 m, and by more "
               "than motion and 4 sigma explain, but less than a jump",
-              "a step back; disarmed; for steps along the course: a measured time offset that is "
-              "too small to explain them; for steps across (in a hover: all): the position is "
-              "found again after `bridging` or `lost`",
+              "disarmed; a step back; for steps along the course: the time offset is measured and "
+              "too small to explain them; for others (in a hover: all): the position is found "
+              "again after `bridging` or `lost`",
               f"the position may be wrong by N (sum of steps, 3 m at most), {_ADDED}",
               "keep N more distance to obstacles", repeat_s=60.0),
     AlertSpec(A.TILT_MISMATCH, WARNING, "tilt mismatch", "tilt {degrees:.0f} deg off autopilot",

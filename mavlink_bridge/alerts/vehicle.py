@@ -56,15 +56,16 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "on the ground: do not take off unless planned; in flight, if nothing is injected, "
           f"{_TAKE_OVER}"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
-          "UDP: MAVLink arrives from another address than `bridge.sender` or, if not set, the "
-          "first autopilot (`bridge.ground_connection`: the first ground station); "
-          "once for each",
+          "UDP: MAVLink arrives from another host or port than `bridge.sender` or, if not set, the "
+          "first autopilot (`bridge.ground_connection`: the first ground station); SENDER: its "
+          "host; each once, four at most",
           "it is ignored; if it is the autopilot's, no fix reaches it",
-          "set `bridge.sender` to the autopilot's address; find the sender"),
+          "set `bridge.sender` to the autopilot's address; find the sender, perhaps another port "
+          "of the autopilot's host"),
     event(A.GIMBAL_IGNORED, WARNING, "gimbal {component}, device {device} ignored",
           {"component": "id", "device": "id"}, "a second gimbal reports its attitude; once",
-          "only the first gimbal's angles are used",
-          "set `bridge.camera.gimbal_component` to the camera's gimbal"),
+          "only the first gimbal's angles are used, while it sends",
+          "set `bridge.camera.gimbal_component` and `gimbal_device` to the camera's gimbal"),
     event(A.SECOND_COMPANION, WARNING, "another companion is component {component}",
           {"component": "id"}, "a heartbeat with this program's own ids is received; once",
           "another program uses the same ids, and may send fixes too",
@@ -77,7 +78,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           f"{_TAKE_OVER}; on the ground change one system id"),
     event(A.AUTOPILOT_IGNORED, WARNING, "autopilot {system} ignored, using {used}",
           {"system": "id", "used": "id"}, "an autopilot with another system id is heard, and "
-          "`bridge.system_id` is not set; once", "its messages are ignored",
+          "`bridge.system_id` is not set; once",
+          "its messages are ignored; fixes go to the one in use",
           "set `bridge.system_id` to your vehicle's"),
     event(A.ARMING_ALTERNATES, WARNING, "system {system} armed, disarmed in turn", {"system": "id"},
           "heartbeats change from armed to disarmed three times in 10 s; once",

@@ -285,8 +285,8 @@ class SourceOrders:
 
     @property
     def current(self) -> int | None:
-        """The source set of the flight controller, by its acknowledgements and texts; None if
-        unknown.
+        """The source set of the flight controller, by its acknowledgements and texts; the GNSS set
+        until then (PX4, which has no sets: always); None if unknown.
         """
         return self._switch.current
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,9 +39,9 @@ class FoundSource:
 
     @property
     def arguments(self) -> str:
-        """As command-line arguments."""
-        georeference = f" --georeference {self.georeference}" if self.georeference else ""
-        return " ".join(map(str, self.sources)) + georeference
+        """As command-line arguments, quoted for a shell."""
+        given = ("--georeference", self.georeference) if self.georeference else ()
+        return shlex.join(map(str, (*self.sources, *given)))
 
 
 def source_in(folder: Path, georeference_given: bool) -> FoundSource:

@@ -31,7 +31,7 @@ class Changes:
 
 
 def apply_changes(plan: WorldPlan, changes: Changes) -> WorldPlan:
-    """The plan after the changes; ground and streets stay."""
+    """The plan after the changes; ground and streets stay. `regrown` is left to the tiles."""
     rng = plan.config.rng(61, changes.seed)
     draw = rng.random(len(plan.buildings))
     buildings = []

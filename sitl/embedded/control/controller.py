@@ -109,7 +109,8 @@ class SetPoint:
         return self.position == self.end
 
     def move(self, vehicle: Vector, limits: ControlLimits, dt: float) -> None:
-        """Advance the set point by dt seconds. vehicle: the vehicle's position, NED m.
+        """Advance the set point by dt seconds (above 0). vehicle: the vehicle's estimated position,
+        NED m from the EKF's origin.
 
         The set point slows down if the vehicle lags by more than half of 2 m + 1.5 s at full speed,
         and stops at the whole of that distance.

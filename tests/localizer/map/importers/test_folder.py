@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 import pytest
 
 from localizer.errors import MapSourceError
@@ -42,12 +44,12 @@ def test_a_given_georeference_goes_before_the_folder_s(tmp_path):
 
 
 def test_several_ways_are_listed_as_commands(tmp_path):
+    holds = _folder(tmp_path / "my map", MESH, COORDS, DSM, ORTHO)
     with pytest.raises(MapSourceError, match="several ways") as error:
-        source_in(_folder(tmp_path, MESH, COORDS, DSM, ORTHO), georeference_given=False)
-    lines = str(error.value).splitlines()[1:]
-    assert len(lines) == 2
-    assert f"{tmp_path / MESH} --georeference {tmp_path / COORDS} --out" in lines[0]
-    assert f"{tmp_path / DSM} {tmp_path / ORTHO} --out" in lines[1]
+        source_in(holds, georeference_given=False)
+    mesh, elevation = (shlex.split(line) for line in str(error.value).splitlines()[1:])
+    assert mesh[3:-2] == [str(holds / MESH), "--georeference", str(holds / COORDS)]
+    assert elevation[3:-2] == [str(holds / DSM), str(holds / ORTHO)]
 
 
 @pytest.mark.parametrize(
