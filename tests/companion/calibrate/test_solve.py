@@ -78,7 +78,7 @@ def found_of(sighted: list[CalibrationFrame]) -> CalibrationResult:
     solution = solve(CalibrationProblem(sighted, TOLD, np.eye(3), np.zeros(3)))
     return CalibrationResult(
         TOLD, np.eye(3), np.zeros(3), solution, solution.covariance, 1.0, solution.pixel_sigma,
-        len(sighted), 1, 0.5, (),
+        len(sighted), 1, (),
     )  # fmt: skip
 
 
