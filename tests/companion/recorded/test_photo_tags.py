@@ -97,7 +97,9 @@ def test_a_position_that_is_no_place_is_named_and_none_is_none(tmp_path):
             position = read_photo_tags(write_photo(tmp_path / "f.jpg", xmp)).telemetry().position
             assert position.sigma_m == 3.0
     wrong = write_photo(tmp_path / "d.jpg", dji(GpsLatitude="124.0", GpsLongitude="8.0"))
-    assert "latitude 124, longitude 8: no place on Earth" in read_photo_tags(wrong).wrong_place
+    assert "latitude 124, longitude 8: no place on Earth" in (
+        read_photo_tags(wrong).wrong_place or ""
+    )
     assert read_photo_tags(wrong).telemetry().position is None
     (tmp_path / "e.jpg").write_bytes(b"\xff\xd8 cut off")
     with pytest.raises(FootageError, match="not an image"):
