@@ -99,6 +99,7 @@ class FlightControllerEnd:
         self._warnings = FixWarnings(shared, self.sender.injector, notifier)
         self._strangers = UnexpectedSenderMonitor(config, shared.tracker, notifier, self.counters)
         self._next_check_ns = 0
+        self._fuses_beside_gnss = False
         self._connected = False
         self._mode: Mode = "off"
 
@@ -108,14 +109,13 @@ class FlightControllerEnd:
 
     def on_gnss(self, now_ns: int) -> bool | None:
         """Whether the EKF uses GNSS; None if its source set is unknown. With a message that is the
-        EKF's receiver or fused beside GNSS: False if the set is unknown, or a fix was sent in the
-        last 10 s.
+        EKF's receiver or fused beside GNSS, and on PX4, which has no source sets: False if the set
+        is unknown, or a fix was sent in the last 10 s.
         """
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
-        if self._shared.config.injection.message in unswitched and (
-            current is None or self.sender.may_feed_ekf(now_ns)
-        ):
+        beside = self._shared.config.injection.message in unswitched or self._fuses_beside_gnss
+        if beside and (current is None or self.sender.may_feed_ekf(now_ns)):
             return False
         return None if current is None else self.sources.on_gnss
 
@@ -293,6 +293,7 @@ class FlightControllerEnd:
         if mode == "off" or not state.connected:
             sender.injector.clear()
             return now_ns + _IDLE_NS
+        self._fuses_beside_gnss = state.autopilot == "px4"
         profile = select_profile(state.autopilot, state.version)
         self._warnings.check_firmware(state, profile)
         sender.step(link, state, mode, now_ns)

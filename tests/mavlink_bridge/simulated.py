@@ -110,6 +110,7 @@ class Flight:
         self.ekf_north_m = 0.0
         self.gnss_north_m: float | None = None  # None: no receiver
         self.armed = False
+        self.autopilot = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
         self.reset_count = 0
         self.latency_ms = 50
         self.answers_timesync = True
@@ -177,7 +178,8 @@ class Flight:
     def _vehicle(self, step: int) -> None:
         boot_ms = self.boot_ns(self.now_ns) // MS
         if step % 100 == 0:
-            self.say(mavlink.MAVLink_heartbeat_message(2, 3, 209 if self.armed else 81, 4, 4, 3))
+            mode = 209 if self.armed else 81
+            self.say(mavlink.MAVLink_heartbeat_message(2, self.autopilot, mode, 4, 4, 3))
         if step % 20 == 0 and self.gnss_north_m is not None:
             self._gnss(boot_ms, self.gnss_north_m)
         if step % 4 == 0:

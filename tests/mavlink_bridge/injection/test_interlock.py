@@ -402,6 +402,21 @@ def test_what_gps_input_told_the_receiver_is_no_word_for_vision(monkeypatch):
     assert told(flight, *SHADOW) == 2 * [AlertId.INJECTION_NOT_READY]
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "depends"),
+    [(mavlink.MAV_AUTOPILOT_PX4, True), (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, False)],
+)
+def test_px4_fuses_vision_beside_gnss_so_its_position_is_no_evidence(
+    monkeypatch, autopilot, depends
+):
+    """It has no source sets: the bridge took its position for GNSS while vision moved it."""
+    flight = on_gnss(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=100, force=True))
+    flight.autopilot = autopilot
+    flight.run(5.0)
+    assert flight.vision()
+    assert flight.end.on_gnss(flight.now_ns) is not depends
+
+
 def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(monkeypatch):
     injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input", gps_id=1)
     flight = on_gnss(monkeypatch, mode="shadow", injection=injection)
