@@ -99,7 +99,6 @@ class FlightControllerEnd:
         self._warnings = FixWarnings(shared, self.sender.injector, notifier)
         self._strangers = UnexpectedSenderMonitor(config, shared.tracker, notifier, self.counters)
         self._next_check_ns = 0
-        self._fuses_beside_gnss = False
         self._connected = False
         self._mode: Mode = "off"
 
@@ -114,7 +113,8 @@ class FlightControllerEnd:
         """
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)
-        beside = self._shared.config.injection.message in unswitched or self._fuses_beside_gnss
+        is_px4 = self._shared.tracker.snapshot(now_ns).autopilot == "px4"
+        beside = is_px4 or self._shared.config.injection.message in unswitched
         if beside and (current is None or self.sender.may_feed_ekf(now_ns)):
             return False
         return None if current is None else self.sources.on_gnss
@@ -293,7 +293,6 @@ class FlightControllerEnd:
         if mode == "off" or not state.connected:
             sender.injector.clear()
             return now_ns + _IDLE_NS
-        self._fuses_beside_gnss = state.autopilot == "px4"
         profile = select_profile(state.autopilot, state.version)
         self._warnings.check_firmware(state, profile)
         sender.step(link, state, mode, now_ns)
