@@ -322,7 +322,7 @@ def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
 
 
 def _error(engine: EngineHealth) -> AlertId:
-    return AlertId.MAP_LOADING if engine.map_loading else AlertId.LOCALIZATION_FAILED
+    return AlertId.NO_MAP_IN_VIEW if engine.no_map_in_view else AlertId.LOCALIZATION_FAILED
 
 
 def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:

@@ -54,8 +54,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "frames are received, but none was processed for 2 s, without an error; not after "
               "`lost`", WHILE, _NO_FIX, f"{_TAKE_OVER}; after landing read the log"),
     condition(A.LOCALIZATION_FAILED, WARNING, "localization failed, see the log", {},
-              "no frame was processed for 2 s, or none yet, because of an error", WHILE, _NO_FIX,
-              f"{_TAKE_OVER}; land and read the log"),
+              "no frame was processed for 2 s, or none yet, because of another error",
+              WHILE, _NO_FIX, f"{_TAKE_OVER}; land and read the log"),
     condition(A.OVERLOADED, WARNING, "overloaded, {done:.0f} of {offered:.0f} frames/s",
               {"done": "Hz", "offered": "Hz"},
               "over 5 s fewer than 3 frames/s are processed, and 6 or more received", WHILE,
@@ -76,9 +76,9 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.SEARCHING, INFO, "searching the map", {},
               "no position is known since the start", "the first frame is processed", _NO_FIX,
               "give the position"),
-    condition(A.MAP_LOADING, INFO, "map being loaded", {},
-              "no frame was processed for 2 s, or none yet, because map tiles are read",
-              WHILE, _NO_FIX, _TAKE_OVER),
+    condition(A.NO_MAP_IN_VIEW, NOTICE, "no map in view", {},
+              "no frame was processed for 2 s, or none yet: map tiles are read, the camera is too "
+              "near the ground (take-off), or looks past the map", WHILE, _NO_FIX, _TAKE_OVER),
     condition(A.WAITING_FOR_PRIOR, INFO, "waiting for attitude and height", {},
               "no position is known, and the autopilot's attitude or altitude or the gimbal's "
               "angles are missing", WHILE, f"{_NO_FIX}; the map cannot be searched",

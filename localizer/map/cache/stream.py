@@ -86,7 +86,7 @@ class TileStreamer:
         self._arrived_bytes = 0
         self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
-        self._closed = self._waiting = False
+        self._closed = self._waiting = self._lacking = False
         self._hold = _held(cache)
         self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
         self._thread.start()
@@ -163,6 +163,12 @@ class TileStreamer:
         with self._lock:
             return self._waiting and not (self._nodes.evicted or self._to_load())
 
+    @property
+    def lacks_tiles(self) -> bool:
+        """Whether the latest `select` lacked tiles that were to be read; they may be here now."""
+        with self._lock:
+            return self._lacking
+
     def close(self) -> None:
         """Stop the loader thread (waits at most 10 s), drop all tiles, and unlock the cache."""
         with self._lock:
@@ -193,6 +199,7 @@ class TileStreamer:
         choice = self._selector.select(world_from_camera, camera, self._nodes.resident, limits)
         self._protected = {0, *choice.wanted.tolist(), *choice.shown.tolist()}
         self._queue = [n for n in choice.requests.tolist() if not self._failed.is_waiting(n)]
+        self._lacking = bool(self._queue)
         self._lock.notify_all()
         return choice
 

@@ -104,7 +104,7 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, of):
         (EngineHealth(frames_in=3, searches=2, searching=True), AlertId.SEARCHING),
         (EngineHealth(frames_in=3, searches=2), AlertId.SEARCHING),  # between two searches
         (EngineHealth(frames_in=3, last_error="x"), AlertId.LOCALIZATION_FAILED),
-        (EngineHealth(frames_in=3, last_error="x", map_loading=True), AlertId.MAP_LOADING),
+        (EngineHealth(frames_in=3, last_error="x", no_map_in_view=True), AlertId.NO_MAP_IN_VIEW),
     ],
 )
 def test_what_is_waited_for_is_told(tmp_path, engine, of):
