@@ -196,7 +196,6 @@ def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
     assert sigmas[0] < 0.7
     assert 1.5 < sigmas[-1] <= 2.0
     assert it.counters["withheld_covariance"] > 10
-    assert it.reason is not None
     assert it.reason.id in (AlertId.SIGMA_OVER_LIMIT, AlertId.NO_FRESH_FIX)
 
 
@@ -253,7 +252,6 @@ def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
     sent = None
     for t in range(SECOND + 21 * MS, SECOND + 200 * MS, MS):
         sent = sent or it.step(t, context())
-    assert sent is not None
     assert sent.message.reset_counter == 1
     assert sent.message.x == pytest.approx(10.0, abs=0.1)
 
