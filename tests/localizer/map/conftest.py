@@ -176,7 +176,8 @@ def write_raster(path: Path, data, crs="EPSG:32632", step=1.0, place=PLACE, **op
         for name, value in told.items():
             setattr(out, name, value)
         out.write(data)
-        out.update_tags(**tags)
+        if tags:
+            out.update_tags(**tags)
     return path
 
 
