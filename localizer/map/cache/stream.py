@@ -2,8 +2,8 @@
 
 `select` does not wait for the disk unless told to. Resident parents replace missing detail. One
 thread loads tiles (decoding releases the GIL); least recently used nodes are evicted when the byte
-budget is full. `TileStreamer.lacks_tiles`: whether the latest selection lacked tiles that were to be read,
-which may be in memory by now.
+budget is full. `TileStreamer.lacks_tiles`: whether the latest selection lacked tiles that were to
+be read; they may be in memory by now.
 """
 
 from __future__ import annotations
