@@ -135,11 +135,13 @@ class HealthMonitor:
         if self._file is not None:
             self._file.stop()
 
-    def end(self, how: str) -> None:
+    def end(self, how: str, *, is_failure: bool = False) -> None:
         """Set the reason for which the flight ends. From now on nothing is reported until `stop`,
-        whose last report states it.
+        whose last report states it. is_failure: the video failed, which is reported at once.
         """
         self._ended = how
+        if is_failure:
+            self._bridge.set_health(HealthLevel.FAILED, (alert(AlertId.VIDEO_FAILED),))
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Add an estimate, accepted or not. Never blocks."""

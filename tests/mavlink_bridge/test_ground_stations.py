@@ -27,6 +27,7 @@ from mavlink_bridge.camera.messages import camera_information, video_stream_info
 from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.link.transport import UdpTransport
 
 SECOND = 10**9
 ROOT = Path(__file__).parents[2]
@@ -111,6 +112,26 @@ def test_the_aircraft_is_sent_once_a_second_and_only_where_it_is_wanted():
             cot.close()
             got = [etree.fromstring(listener.recv(65536)).get("uid") for _ in range(expected + 1)]
             assert got == ["pilot-aircraft-UAS 7"] * expected + ["pilot-target-3"]
+
+
+def test_the_ground_stations_name_is_resolved_again_only_after_an_error(monkeypatch):
+    """Each event asked the name server, on the thread that sends the targets."""
+    asked, sent = [], []
+    monkeypatch.setattr(socket, "gethostbyname", lambda name: asked.append(name) or "127.0.0.1")
+
+    def send(transport, data):
+        sent.append(data)
+        if len(sent) == 2:
+            raise OSError("network is unreachable")
+        return len(data)
+
+    monkeypatch.setattr(UdpTransport, "write", send)
+    cot = CursorOnTarget(COT.model_copy(update={"cot_endpoint": "station:9"}), CAMERA, UTC)
+    for _ in range(4):
+        cot.send(TargetReport(SECOND, 47.0, 8.0, 450.0, target_id=3))
+    cot.close()
+    assert asked == ["station"] * 2
+    assert len(sent) == 4
 
 
 def _marks(reports, **targets):

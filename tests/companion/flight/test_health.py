@@ -37,7 +37,7 @@ class FakeBridge:
     def state(self):
         return SimpleNamespace(connected=self._connected)
 
-    def set_health(self, level, alerts, *, tell):
+    def set_health(self, level, alerts, *, tell=True):
         known = {alert.id for alert in alerts} & {FAULT.id, FROZEN.id}  # told by bridge and monitor
         assert tell is (self._connected and not known)  # as is a silent vehicle
         self.told.append((level, *(alert.id for alert in alerts)))
@@ -350,3 +350,16 @@ def test_its_first_turn_is_its_start_not_its_making():
     begun_ns = monitor.last_tick_ns
     monitor.stop()
     assert begun_ns - made_ns >= 36_000_000_000
+
+
+def test_a_video_that_fails_is_told_before_the_end(tmp_path):
+    """It ends the flight at once: the next second's report had only the end."""
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        EngineHealth, bridge, lambda: StreamState.CLOSED, lambda *_: None, tmp_path
+    )
+    monitor.start()
+    monitor.end("the feed ended: damaged", is_failure=True)
+    monitor.stop()
+    assert bridge.told == [(HealthLevel.FAILED, AlertId.VIDEO_FAILED)]
+    assert [alert.id for alert in bridge.said] == [AlertId.ENDING]

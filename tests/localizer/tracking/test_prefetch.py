@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from localizer.config import LocalizerConfig
-from localizer.errors import MapLoadingError, ModelError, OutsideMapError, RenderError
+from localizer.errors import (
+    MapCacheError,
+    MapLoadingError,
+    ModelError,
+    OutsideMapError,
+    RenderError,
+)
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.registration.config import JNGOConfig
