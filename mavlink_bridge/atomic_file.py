@@ -13,8 +13,8 @@ PRIVATE = 0o600
 
 
 def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = False) -> None:
-    """Write the text beside the file and rename it; raises `OSError` if the disk refuses; the old file
-    stays then.
+    """Write the text beside the file and rename it. If the disk refuses, it raises `OSError`, and
+    the old file stays.
 
     The temporary file is always a new one, so a symbolic link of another user is not followed.
     durable: the text is on the disk before the file is renamed, so that it survives a power loss.
