@@ -70,7 +70,7 @@ class LoopRecord:
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`. back:
     restart times after a kill or hang; None without one. shadow: the health at the start of the
     recorded part; None if injection was forced. standing: alerts raised before the recorded part
-    and not cleared before it; their at_s is negative.
+    and not cleared before it, at_s negative; only of a deployment that is wrong from the start.
     """
 
     samples: tuple[LoopSample, ...]
@@ -249,7 +249,7 @@ def standing_alerts(texts: Sequence[Text]) -> tuple[Text, ...]:
 
 def _reported(record: LoopRecord, of: AlertId) -> LoopExpectationResult:
     """Check that the operator was told: in the recorded part, or before it with no clearing."""
-    found = [t for t in (*record.standing, *record.texts) if t.alert is of]
+    found = [t for t in (*record.standing, *record.texts) if t.raised and t.alert is of]
     at = f"at {found[0].at_s:.1f} s" if found else "never"
     return LoopExpectationResult(f"reports {of.words}", bool(found), at)
 

@@ -192,6 +192,7 @@ class _LoopFlight:
             for t in self._pilot.record.texts
             if t.time_ns <= self._end_ns
         ]
+        before = [t for t in texts if t.at_s < 0.0]
         return LoopRecord(
             self._with_errors(),
             tuple(t for t in texts if t.at_s >= 0.0),
@@ -200,7 +201,7 @@ class _LoopFlight:
             longest_stall(self._ticks),
             self._back(),
             self._shadow,
-            standing_alerts([t for t in texts if t.at_s < 0.0]),
+            standing_alerts(before) if self._case.wrong != DeploymentErrors() else (),
         )
 
     # --- before ----------------------------------------------------------------------------------

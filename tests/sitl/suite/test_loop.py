@@ -97,8 +97,11 @@ def test_an_alert_raised_before_the_recorded_part_counts_while_it_stands(
     )
     standing = standing_alerts(before if cleared else before[:1])
     flown = replace(record(flight([0.5] * 4)), texts=(), standing=standing)
-    held = evaluate(flown, Expectation(reports=(AlertId.VIDEO_FROZEN,)))[-1]
+    expect = Expectation(reports=(AlertId.VIDEO_FROZEN,))
+    held = evaluate(flown, expect)[-1]
     assert (held.ok, held.seen) == (ok, "at -3.0 s" if ok else "never")
+    only_end = replace(flown, standing=(), texts=(replace(before[1], at_s=1.0),))
+    assert not evaluate(only_end, expect)[-1].ok
 
 
 @pytest.mark.parametrize(("injects_s", "ok"), [(4.9, True), (5.1, False), (float("inf"), False)])
