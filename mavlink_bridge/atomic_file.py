@@ -31,7 +31,7 @@ def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = 
                 os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException:
-        temporary.unlink()  # its part of the text takes room of a full disk
+        temporary.unlink(missing_ok=True)  # its part of the text takes room of a full disk
         raise
 
 

@@ -62,9 +62,9 @@ class CursorOnTarget:
         self._write(aircraft_on_map(view, self._config, self._camera, self._utc))
 
     def close(self) -> None:
-        """Close the socket."""
-        with self._lock:
-            self._forget()
+        """Close the socket. Never blocks."""
+        if self._socket is not None:
+            self._socket.close()
 
     def _write(self, event: bytes) -> None:
         with self._lock:
@@ -73,12 +73,8 @@ class CursorOnTarget:
                 self._socket.write(event)
             except OSError as error:
                 _log.debug("Cursor-on-Target not sent: %s", error)
-                self._forget()
-
-    def _forget(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = None
+                self.close()
+                self._socket = None
 
 
 def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc) -> bytes:

@@ -4,6 +4,7 @@ import contextlib
 import json
 import math
 import socket
+import threading
 from itertools import count
 from pathlib import Path
 
@@ -132,6 +133,26 @@ def test_the_ground_stations_name_is_resolved_again_only_after_an_error(monkeypa
     cot.close()
     assert asked == ["station"] * 2
     assert len(sent) == 4
+
+
+def test_closing_does_not_wait_for_a_name_server(monkeypatch):
+    """It would keep the bridge from ending, and the record after it."""
+    asked, closed, order = threading.Event(), threading.Event(), []
+
+    def resolve(_name):
+        asked.set()
+        order.append("closed" if closed.wait(5.0) else "gave up")
+        raise OSError("no answer")
+
+    monkeypatch.setattr(socket, "gethostbyname", resolve)
+    cot = CursorOnTarget(COT.model_copy(update={"cot_endpoint": "station:9"}), CAMERA, UTC)
+    sender = threading.Thread(target=cot.send, args=(TargetReport(SECOND, 47.0, 8.0, 450.0),))
+    sender.start()
+    assert asked.wait(30.0)
+    cot.close()
+    closed.set()
+    sender.join()
+    assert order == ["closed"]
 
 
 def _marks(reports, **targets):

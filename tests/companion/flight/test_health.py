@@ -113,6 +113,20 @@ def test_what_is_waited_for_is_told(tmp_path, engine, of):
     assert told[-1] == (HealthLevel.STARTING, of)
 
 
+def test_a_map_that_cannot_be_read_is_reported_before_the_first_fix_and_after_the_last(
+    tmp_path, monkeypatch
+):
+    """A disk that fails empties the view: `no map in view` alone is also that of each take-off."""
+    engine = EngineHealth(frames_in=3, last_error="x", no_map_in_view=True)
+    expected = (AlertId.NO_MAP_IN_VIEW, AlertId.MAP_UNREADABLE)
+    options: dict[str, Any] = {"engine": engine, "unreadable_nodes": lambda: 3}
+    told, _ = _one_report(tmp_path, StreamState.LIVE, True, **options)
+    assert told[-1] == (HealthLevel.STARTING, *expected)
+    monkeypatch.setattr("companion.flight.health._STALE_S", -1.0)
+    told, _ = _one_report(tmp_path, StreamState.LIVE, True, TrackingState.TRACKING, **options)
+    assert told[-1] == (HealthLevel.DEGRADED, *expected)
+
+
 def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
     """Found on ArduPilot: the yaw guard refused every fix, LAND without a position, health ok."""
     told, _ = _one_report(
