@@ -78,8 +78,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "no position is known since the start", "the first frame is processed", _NO_FIX,
               "give the position"),
     condition(A.NO_MAP_IN_VIEW, NOTICE, "no map in view", {},
-              "no frame was processed for 2 s, or none yet: map tiles are being read, or the camera "
-              "is too near the ground (take-off) or looks past the map", WHILE, _NO_FIX,
+              "no frame was processed for 2 s, or none yet: map tiles are being read, or the "
+              "camera is too near the ground (take-off) or looks past the map", WHILE, _NO_FIX,
               "in flight take over; check the camera's mount and the map's extent"),
     condition(A.WAITING_FOR_PRIOR, INFO, "waiting for attitude and height", {},
               "no position is known, and the autopilot's attitude or altitude or the gimbal's "
