@@ -245,6 +245,26 @@ def test_pictures_that_come_again_are_forgotten() -> None:
     assert last.focal.value == pytest.approx(before.focal.value, abs=0.002)
 
 
+@pytest.mark.parametrize("since_s", [18.0, 20.2])
+def test_excluded_frames_do_not_bring_a_discarded_time_offset_back(since_s: float) -> None:
+    """A video that repeats itself is excluded from before, or just after, the step it makes."""
+    known = []
+
+    class Doubted(Flown):
+        def _sighting(self, at_s: float) -> CalibrationObservation:
+            if at_s == 20.0:
+                self.watch.suspect_timestamps(20_000_000_000)
+            if at_s == 23.0:
+                self.watch.exclude_since(round(since_s * 1e9))
+                known.append(self.watch.figures().late_s.is_within(0.15))
+            return super()._sighting(at_s)
+
+    flown = Doubted(Wrong(), square(60.0, climb_s=0.0), lost).fly()
+    before = next(figures for at_s, figures in flown.found if at_s >= 19.0)
+    assert before.late_s.is_within(0.15)
+    assert known == [False]
+
+
 def test_switched_off_it_says_nothing() -> None:
     flown = Flown(Wrong(focal=0.05), square(30.0), limits=CalibrationLimits(enabled=False)).fly()
     assert ever(flown) == set()
