@@ -256,7 +256,7 @@ def _gradient(stack: MapStack, setting: Setting) -> Tracking:
     localizer = Localizer(
         stack.renderer, DetailExtractor(GradientExtractor()), JNGO(config.registration, threads=1),
         setting.camera, config, map_frame=stack.cache.frame,
-        is_loading=lambda: not stack.streamer.idle,
+        is_loading=lambda: stack.streamer.lacks_tiles,
     )  # fmt: skip
     return Ours(localizer)
 

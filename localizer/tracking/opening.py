@@ -96,7 +96,7 @@ def build_localizer(
         stack.renderer, extractor, optimizer, camera, config, sensors,
         map_frame=stack.cache.frame, map_kind=kind, terrain=terrain,
         ground=ground_uncertainty(stack.cache.index, kind),
-        on_close=on_close, is_loading=lambda: not stack.streamer.idle,
+        on_close=on_close, is_loading=lambda: stack.streamer.lacks_tiles,
     )  # fmt: skip
 
 
