@@ -248,7 +248,7 @@ def test_pictures_that_come_again_are_forgotten() -> None:
 @pytest.mark.parametrize("since_s", [18.0, 20.2])
 def test_excluded_frames_do_not_bring_a_discarded_time_offset_back(since_s: float) -> None:
     """A video that repeats itself is excluded from before, or just after, the step it makes."""
-    known = []
+    sigmas = []
 
     class Doubted(Flown):
         def _sighting(self, at_s: float) -> CalibrationObservation:
@@ -256,13 +256,13 @@ def test_excluded_frames_do_not_bring_a_discarded_time_offset_back(since_s: floa
                 self.watch.suspect_timestamps(20_000_000_000)
             if at_s == 23.0:
                 self.watch.exclude_since(round(since_s * 1e9))
-                known.append(self.watch.figures().late_s.is_within(0.15))
+                sigmas.append(self.watch.figures().late_s.sigma)
             return super()._sighting(at_s)
 
     flown = Doubted(Wrong(), square(60.0, climb_s=0.0), lost).fly()
     before = next(figures for at_s, figures in flown.found if at_s >= 19.0)
-    assert before.late_s.is_within(0.15)
-    assert known == [False]
+    assert before.late_s.sigma < 0.1
+    assert sigmas == pytest.approx([0.15], rel=0.05)  # as at a start
 
 
 def test_switched_off_it_says_nothing() -> None:
