@@ -19,7 +19,8 @@ from localizer.errors import LocalizerError
 from localizer.geometry.antimeridian import geo_box
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
-from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
+from mavlink_bridge.preflight.doctor import Diagnosis
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 _OLD_SHADOW_DAYS = 7
 WHEN_VISION_ENDS = (
