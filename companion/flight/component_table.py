@@ -70,7 +70,6 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.injection.restart_memory import RestartMemory
 from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
@@ -635,4 +634,4 @@ def _inhibit_memory(config: CompanionConfig) -> InhibitMemory | None:
     cameras = [one.model_dump(mode="json") for one in (config.camera, config.bridge.camera)]
     about = json.dumps([readable_map_hash(config.map), *cameras])  # escaped: paths may be no UTF-8
     digest = hashlib.sha256(about.encode()).hexdigest()
-    return InhibitMemory(RestartMemory(file.with_name("guardian-forbids.json"), about=digest))
+    return InhibitMemory(file.with_name("guardian-forbids.json"), about=digest)
