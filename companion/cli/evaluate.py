@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.shared_options import Device, FeatureNetwork, Renderer, WorkingWidth
 from companion.errors import ConfigError
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import sequence_of
@@ -45,10 +46,8 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.trajectory import StampedPose, write_tum
 from localizer.pictures import write_rgb
-from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.render.base import MapRenderer
-from localizer.render.select import RendererName
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Undistorter
 
@@ -98,15 +97,10 @@ def evaluate_command(
             min=0.01, max=1000, help="also use height, with random errors of this sigma, m"
         ),
     ] = None,
-    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
-    renderer: Annotated[
-        RendererName, typer.Option(help="auto: a GPU if there is one, otherwise numba")
-    ] = "auto",
-    device: Annotated[
-        DeviceChoice,
-        typer.Option(help="runs the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
-    ] = "auto",
-    model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
+    width: WorkingWidth = 320,
+    renderer: Renderer = "auto",
+    device: Device = "auto",
+    model: FeatureNetwork = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
 ) -> None:
     """Localize every frame of a recorded sequence from a perturbed prior and measure it."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics, camera_rotation, vehicle_prior
+from companion.inertial import AttitudeTelemetry
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.sensors.error_model import SENSORS
@@ -22,7 +23,7 @@ from localizer.tracking.engine import PriorProvider
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.injection.shadow import gnss_healthy
-from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
 _CONST_POSITION = 128  # EKF_CONST_POS_MODE of EKF_STATUS_REPORT (193): it only knows that it is
@@ -38,20 +39,8 @@ _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
 _BESIDE_M, _REPORT_S = 3.0, 0.5  # of the receiver: an EKF farther off follows something else
 
 
-class AutopilotSource(Protocol):
-    """Telemetry that the priors read: from the bridge in flight, from a record afterwards."""
-
-    def state(self) -> VehicleState:
-        """Newest state of the vehicle."""
-        ...
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
-        ...
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a CLOCK_MONOTONIC time; None if unknown."""
-        ...
+class AutopilotSource(AttitudeTelemetry, Protocol):
+    """Telemetry that the priors read."""
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's position (north, east, down) from its origin, m, at a CLOCK_MONOTONIC time;
