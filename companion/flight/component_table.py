@@ -296,9 +296,7 @@ def _vital_signs(context: BuildContext) -> VitalSigns:
 
 def _autopilot(context: BuildContext) -> AutopilotPose:
     bridge = context[Bridge]
-    autopilot = AutopilotPose(
-        bridge, context[CameraExtrinsics], context.config.prior, lambda: bridge.on_gnss
-    )
+    autopilot = AutopilotPose(bridge, context[CameraExtrinsics], lambda: bridge.on_gnss)
     context.channels.estimates.subscribe(
         lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
     )
@@ -311,7 +309,6 @@ def _last_fix(context: BuildContext) -> FixMemory:
     folder = config.state_folder
     memory = FixMemory(
         folder and folder / "last-fix.json",
-        config.prior,
         context[AutopilotPose],
         context[CameraExtrinsics],
         lambda time_ns: local_near(bridge, time_ns),

@@ -92,6 +92,6 @@ def criterion_result(
     """Compare a value, None if it is not known, with its limit."""
     known = advice(name)
     found, needed = value_and_limit(value, limit, unit, at_least=at_least)
-    missing = value is None or not math.isfinite(value)
-    ok = not missing and (value >= limit if at_least else value <= limit)
+    figure = math.nan if value is None else value  # which meets no limit
+    ok = math.isfinite(figure) and (figure >= limit if at_least else figure <= limit)
     return CriterionResult(name, found, needed, ok, known.meaning, known.look)
