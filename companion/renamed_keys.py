@@ -25,7 +25,7 @@ RENAMED = {
 """Old path: new path."""
 
 _CONSTANTS = (
-    "bridge.injection.yaw_guard", "integrity_monitor.calibration",
+    "bridge.injection.covariance", "bridge.injection.yaw_guard", "integrity_monitor.calibration",
     "integrity_monitor.gnss_accuracy_cap_m", "integrity_monitor.gnss_repeat_s",
     "integrity_monitor.height_m", "integrity_monitor.jump_hold_s", "integrity_monitor.jump_m",
     "integrity_monitor.motion", "integrity_monitor.picture", "integrity_monitor.tilt_deg",

@@ -79,7 +79,6 @@ class InjectionConfig(StrictModel):
     send_attitude: bool = Field(
         default=True, description="false: NaN angles in VISION_POSITION_ESTIMATE"
     )
-    covariance: Literal["profile", "cbrt", "sqrt", "variance"] = Field("profile", exclude=True)
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
     gps_velocity: bool = Field(default=True, description="GPS_INPUT holds a velocity")
     gps_yaw: bool = Field(default=False, description="GPS_INPUT holds a yaw")
