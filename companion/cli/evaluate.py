@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -66,7 +66,7 @@ def evaluate_command(
     report: Annotated[Path, typer.Option(help="folder of the report")] = Path("eval-report"),
     name: Annotated[str | None, typer.Option(help="sequence of the PiLoT data set")] = None,
     prior: Annotated[
-        str,
+        Literal["first", "each", "lost", "none"],
         typer.Option(
             help="approximate pose of: first, the first frame; each, every frame; lost, the first, "
             "100 to 500 m off; none: search"
@@ -104,8 +104,6 @@ def evaluate_command(
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
 ) -> None:
     """Localize every frame of a recorded sequence from a perturbed prior and measure it."""
-    if prior not in ("first", "each", "lost", "none"):
-        raise ConfigError(f"--prior is first, each, lost or none, not {prior!r}")
     searched = prior in ("lost", "none")
     if known_heading and not searched:
         raise ConfigError("--known-heading goes with --prior lost or none")
