@@ -143,12 +143,10 @@ def row(alarms: tuple[str, ...] | None) -> LoopRow:
 def test_the_rate_of_false_alarms_has_its_exact_interval() -> None:
     """Against the tables of Clopper and Pearson: 0 of 20, and 1 of 20."""
     quiet = false_alarm_rate([row(())] * 20 + [row(None)])
-    assert quiet is not None
     assert (quiet.flights, quiet.with_alarm) == (20, 0)
     assert [quiet.low, quiet.high] == pytest.approx([0.0, 0.1684], abs=1e-4)
     assert quiet.hours == pytest.approx(20 * 20 / 3600)
     loud = false_alarm_rate([row(())] * 19 + [row((f"1.0 s: {FROZEN}",))])
-    assert loud is not None
     assert [loud.low, loud.high] == pytest.approx([0.0013, 0.2487], abs=1e-4)
     assert false_alarm_rate([row(None)]) is None
 
