@@ -183,13 +183,13 @@ TARGETS: tuple[AlertSpec, ...] = (
     condition(A.TARGET_SILENT, WARNING, "{name} not reported: {why}",
               {"name": "name", "why": "name"},
               "a detected and reported target's position is rejected for 2 s (WHY); one text in "
-              "10 s", WHILE, "the target is neither sent nor shown", NOTHING),
+              "10 s at most", WHILE, "the target is neither sent nor shown", NOTHING),
 )  # fmt: skip
 CONSOLE: tuple[AlertSpec, ...] = (
     event(A.CONSOLE_STOP, NOTICE, "targets ended", {},
           "the operator ends the targets in the console",
           "all clicked targets, also a ground station's, are deleted; the detector's stay",
-          "by mistake: click again", lead=_CONSOLE),
+          "if by mistake, click again", lead=_CONSOLE),
     event(A.CONSOLE_TARGET, NOTICE, "target at {x:.2f} {y:.2f}", {"x": "", "y": ""},
           "the operator clicks into the console's video",
           "a target is requested at these shares of width and height; `target_found` or a refusal "

@@ -117,7 +117,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "the firmware does not support `bridge.injection.message`", WHILE,
               "the EKF cannot use what is sent", f"{_TAKE_OVER}; set another message"),
     event(A.SOURCE_SET_UNKNOWN, WARNING, "EKF source set not known: met in flight", {},
-          "ArduPilot is armed at its first heartbeat (after a crash of the companion)",
+          "ArduPilot is armed at its first heartbeat, for example after a crash of the companion",
           "until ArduPilot reports a set or accepts one by command, `return_to_gnss` does nothing; "
           "with `bridge.switch.enabled` vision is still selected if GNSS fails, and GNSS if vision "
           "ends",
@@ -160,10 +160,12 @@ VEHICLE: tuple[AlertSpec, ...] = (
           {"system": "id", "why": SenderRefusal},
           "a system that may not do so sends a command; once for each",
           "its commands are denied",
-          "if it is yours: add it to `bridge.ground_systems`, or sign its link"),
+          "if it is yours: add it to `bridge.ground_systems` (not allowed), or sign its link (not "
+          "signed)"),
     event(A.SENDERS_REFUSED, WARNING, "system {system} and more refused: {why}",
           {"system": "id", "why": SenderRefusal},
-          "a fourth system (N) sends a command that it may not; further ones are not reported",
+          "a fourth system (N) sends a command that it may not; further ones are not reported "
+          "until a restart",
           "their commands are denied",
           "add yours to `bridge.ground_systems`, or sign their links"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
