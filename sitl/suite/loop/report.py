@@ -94,8 +94,8 @@ def as_data(rows: Sequence[LoopRow]) -> dict[str, Any]:
     """Rows as JSON data; NaN and infinity become None."""
     rate = false_alarm_rate(rows)
     flights = [asdict(row) | {"ok": row.ok, "slow": row.slow} for row in rows]
-    data: dict[str, Any] = {"flights": flights, "false_alarms": rate and asdict(rate)}
-    return {key: json_value(value) for key, value in data.items()}
+    alarms = None if rate is None else asdict(rate)
+    return {"flights": json_value(flights), "false_alarms": json_value(alarms)}
 
 
 def read_rows(path: Path) -> tuple[LoopRow, ...]:
