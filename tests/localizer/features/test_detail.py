@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.features import GradientExtractor
 from localizer.features.detail import DetailExtractor, detail_level
+from localizer.features.gradient import GradientExtractor
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localizer.features import OnnxExtractor, providers
-from localizer.features.extractor import SHIPPED_MODEL
+from localizer.features import providers
+from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor
 from localizer.features.openvino_session import OpenVinoSession, is_worthwhile
 
 FLAGS = "processor\t: 0\nflags\t\t: fpu avx512f amx_bf16 amx_tile\n"

@@ -7,9 +7,8 @@ import pytest
 
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
-from localizer.odometry import DepthSource, FlatGround
-from localizer.odometry.ground import ground_points, height_above_ground
-from localizer.odometry.keyframe import keyframe_anchors
+from localizer.odometry.ground import FlatGround, ground_points, height_above_ground
+from localizer.odometry.keyframe import DepthSource, keyframe_anchors
 from localizer.registration.sampling import sample_features
 from tests.localizer.odometry.conftest import CAMERA
 from tests.localizer.registration.conftest import camera_pose

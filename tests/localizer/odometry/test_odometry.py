@@ -8,21 +8,19 @@ import pytest
 
 from localizer.errors import OdometryError
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.odometry import (
-    DepthSource,
-    FlatGround,
-    GroundUncertainty,
-    ImageFault,
-    OdometryConfig,
-    OdometryStatus,
-    TerrainModel,
-    Usability,
-    VisualOdometry,
-    odometry_optimizer,
+from localizer.odometry.config import OdometryConfig
+from localizer.odometry.estimate import OdometryStatus
+from localizer.odometry.ground import FlatGround, GroundUncertainty, RangefinderGround, TerrainModel
+from localizer.odometry.keyframe import DepthSource
+from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.usability import ImageFault, Usability
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import (
+    PoseConstraint,
+    attitude_constraint,
+    combine,
+    height_constraint,
 )
-from localizer.odometry.ground import RangefinderGround
-from localizer.registration import JNGO, attitude_constraint, combine, height_constraint
-from localizer.registration.priors import PoseConstraint
 from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
 from tests.localizer.registration.conftest import SyntheticPlace
 

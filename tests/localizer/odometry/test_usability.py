@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.odometry import ImageFault, examine
+from localizer.odometry.usability import ImageFault, examine
 
 SIZE = (240, 320, 3)
 

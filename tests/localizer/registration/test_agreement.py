@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
-from localizer.registration import JNGO
 from localizer.registration.agreement import agreement
 from localizer.registration.backend import camera_from_local, level_problems, local_origin
+from localizer.registration.jngo import JNGO
 from localizer.types import FeatureLevel, RegistrationStatus
 
 
