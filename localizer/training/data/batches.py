@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +107,7 @@ class ShardStream(BatchStream):
         self._generating = generating
         self._closed = threading.Event()
         self._seed = (seed,) if rank == 0 else (seed, rank)
-        self._cache: OrderedDict[Path, list[Pair]] = OrderedDict()
+        self._shard = lru_cache(config.cached_shards)(self._read)
 
     def close(self) -> None:
         """See `BatchStream.close`; also stops waiting for a shard."""
@@ -132,10 +132,7 @@ class ShardStream(BatchStream):
             "with `contact-sheet`"
         )
 
-    def _shard(self, path: Path) -> list[Pair]:
-        if path in self._cache:
-            self._cache.move_to_end(path)
-            return self._cache[path]
+    def _read(self, path: Path) -> list[Pair]:
         self._await(path)
         pairs = read_shard(path)
         width, height = self._config.crop
@@ -144,10 +141,7 @@ class ShardStream(BatchStream):
             raise SequenceError(
                 f"{path}: its images are {size}, less than `crop` asks: {width}x{height}"
             )
-        self._cache[path] = pairs
-        if len(self._cache) > self._config.cached_shards:
-            self._cache.popitem(last=False)
-        return self._cache[path]
+        return pairs
 
     def _await(self, path: Path) -> None:
         while not path.exists():
