@@ -1,3 +1,5 @@
+from dataclasses import asdict
+
 import pytest
 
 from companion.reporting.verdicts import advice, value_and_limit
@@ -9,7 +11,7 @@ GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
 
 def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0, level=100.0, targets=99.0):
-    metrics = LocalizationMetrics(**(GOOD.to_dict() | (localizer or {})))
+    metrics = LocalizationMetrics(**(asdict(GOOD) | (localizer or {})))
     return FlightFigures(
         metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside, level, targets
     )
