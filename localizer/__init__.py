@@ -53,29 +53,41 @@ if TYPE_CHECKING:
 # Imported when they are first used: `import localizer` costs nothing, and who needs geometry alone
 # does not load the network's and the kernels' packages.
 _HOMES = {
-    name: module
-    for module, names in (
-        ("localizer.tracking.pipeline", "Localizer"),
-        ("localizer.tracking.opening", "open_localizer"),
-        ("localizer.config", "LocalizerConfig"),
-        ("localizer.tracking.engine", "DualThreadEngine"),
-        ("localizer.map.building.build", "build_cache"),
-        ("localizer.map.building.options", "BuildOptions"),
-        ("localizer.map.kind", "MapKind"),
-        ("localizer.map.inspection.kind", "map_kind"),
-        ("localizer.geometry.camera", "Camera"),
-        ("localizer.geometry.pose", "Pose"),
-        ("localizer.geometry.geo", "Geodetic LocalFrame"),
-        ("localizer.types", "Frame PosePrior PoseEstimate RegistrationStatus TrackingState"),
-        ("localizer.geometry.posefile", "PoseRow pose_of_row pose_row read_poses write_poses"),
-        ("localizer.geometry.trajectory", "StampedPose read_tum write_tum"),
-        (
-            "localizer.errors",
-            "LocalizerError CameraError GeoreferenceError MapCacheError MapError "
-            "MapSourceError ModelError OutsideMapError PoseFileError RenderError",
-        ),
-    )
-    for name in names.split()
+    "Localizer": "localizer.tracking.pipeline",
+    "open_localizer": "localizer.tracking.opening",
+    "LocalizerConfig": "localizer.config",
+    "DualThreadEngine": "localizer.tracking.engine",
+    "build_cache": "localizer.map.building.build",
+    "BuildOptions": "localizer.map.building.options",
+    "MapKind": "localizer.map.kind",
+    "map_kind": "localizer.map.inspection.kind",
+    "Camera": "localizer.geometry.camera",
+    "Pose": "localizer.geometry.pose",
+    "Geodetic": "localizer.geometry.geo",
+    "LocalFrame": "localizer.geometry.geo",
+    "Frame": "localizer.types",
+    "PosePrior": "localizer.types",
+    "PoseEstimate": "localizer.types",
+    "RegistrationStatus": "localizer.types",
+    "TrackingState": "localizer.types",
+    "PoseRow": "localizer.geometry.posefile",
+    "pose_of_row": "localizer.geometry.posefile:world_from_camera",
+    "pose_row": "localizer.geometry.posefile",
+    "read_poses": "localizer.geometry.posefile",
+    "write_poses": "localizer.geometry.posefile",
+    "StampedPose": "localizer.geometry.trajectory",
+    "read_tum": "localizer.geometry.trajectory",
+    "write_tum": "localizer.geometry.trajectory",
+    "LocalizerError": "localizer.errors",
+    "CameraError": "localizer.errors",
+    "GeoreferenceError": "localizer.errors",
+    "MapCacheError": "localizer.errors",
+    "MapError": "localizer.errors",
+    "MapSourceError": "localizer.errors",
+    "ModelError": "localizer.errors",
+    "OutsideMapError": "localizer.errors",
+    "PoseFileError": "localizer.errors",
+    "RenderError": "localizer.errors",
 }
 
 # In the order of the API page.
@@ -119,10 +131,10 @@ __all__ = [  # noqa: RUF022
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    home, _, own = _HOMES.get(name, "").partition(":")
+    if not home:
         raise AttributeError(f"module 'localizer' has no attribute {name!r}")
-    own = "world_from_camera" if name == "pose_of_row" else name
-    value = getattr(import_module(_HOMES[name]), own)
+    value = getattr(import_module(home), own or name)
     globals()[name] = value
     return value
 

@@ -60,7 +60,6 @@ def test_a_flights_report_is_read_in_the_maps_frame(tmp_path):
     (row,) = table.rows
     assert row[0] == "seed 7"
     assert row[4] == "0.30 / 0.70 / 1.10"
-    assert criteria is not None
     assert [r[3] for r in criteria.rows] == ["**missed**", "yes"]
 
 

@@ -31,8 +31,8 @@ class SearchCancelledError(Exception):
 def competitors(
     candidates: list[PlaceCandidate], registered: list[VerifiedCandidate]
 ) -> list[PlaceCandidate]:
-    """The candidates that a result must stand out from: the best of the search, at least up to the
-    last registered rank.
+    """The candidates that a result must stand out from: the first of the search (whose scores need
+    not descend), at least up to the last registered rank.
     """
     return candidates[: max(_ROUNDS[-1], *(j.rank + 1 for j in registered))]
 

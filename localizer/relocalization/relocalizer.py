@@ -110,8 +110,8 @@ class Relocalizer:
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> list[PlaceCandidate]:
-        """The most similar positions, best first; empty if cancelled, without any, and for a frame
-        without contrast (covered lens).
+        """The most similar positions, in the order of `search.search`; empty if cancelled, without
+        any, and for a frame without contrast (covered lens).
         """
         camera = working_camera(query.frame.camera, min(_SEARCH_WIDTH, query.frame.camera.width))
         image = cv2.GaussianBlur(self._undistorted(query, camera), (0, 0), _BLUR_PX)

@@ -164,11 +164,12 @@ def search(
     pool: ThreadPoolExecutor | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> list[PlaceCandidate] | None:
-    """The positions that look most like `view` from above, the best score first.
+    """The positions that look most like `view` from above, in the order of score divided by its
+    trial's noise: a later one may have the higher score.
 
     At most `candidates` + 1; none if the map has no ground heights there; None if stopped.
     correlators: of the levels, finest first. A candidate's height is the query's. pool: threads
-    that share the work; None: this thread only.
+    that share the work and call should_stop; None: this thread only.
     """
     heights = trial_heights(query, ground_of(correlators[0].level, query), config)
     if len(heights) == 0:
@@ -423,7 +424,7 @@ class _MapSearch:
             scores.trial[window][better] = trial
 
     def candidates(self, scores: Scores, trials: list[BlockScores]) -> list[PlaceCandidate]:
-        """The highest peaks, no two closer than `_SUPPRESSED_M`."""
+        """The highest peaks of `scores`, no two closer than `_SUPPRESSED_M`, in their order."""
         best = scores.best.copy()
         reach = max(2, round(_SUPPRESSED_M / self.correlator.level.cell_m))
         found: list[PlaceCandidate] = []

@@ -62,14 +62,15 @@ HEALTH: tuple[AlertSpec, ...] = (
               "there are too few fixes for the EKF",
               f"{_TAKE_OVER}; check the computer's load and temperature"),
     condition(A.SEARCH_NOT_READY, WARNING, "search not ready", {},
-              "the position is not known, and the map search is being prepared", WHILE, _NO_FIX,
-              _TAKE_OVER),
+              "the position is not known, and the map search is being prepared", WHILE,
+              f"{_NO_FIX} for seconds; without the map's overview (`companion map build "
+              "--overview`) 7 s per km²", _TAKE_OVER),
     condition(A.NO_SEARCH, WARNING, "no map search possible, see the log", {},
               "the map search could not be prepared", "a restart",
               _ONLY_NEAR,
               "on the ground read the log and restart; in flight stay where vision works"),
     condition(A.SEARCH_HANGS, WARNING, "the search hangs", {},
-              "a search (position lost or not yet found) has made no progress for 2 min",
+              "a search has made no progress for 2 min",
               "it goes on; usually only a restart",
               f"{_ONLY_NEAR}; the alert stays when it is found",
               f"{_TAKE_OVER}; on the ground restart the program"),
@@ -110,19 +111,18 @@ HEALTH: tuple[AlertSpec, ...] = (
           {"how": ProcessFault, "what": "name"}, "with `--supervised`: the flight process crashed "
           "or was killed (*died*; WHAT: signal or exit code), or a thread did not run for 4 s, the "
           "process for 3 s (*hangs*; WHAT: thread)",
-          f"it restarts at once; {_NO_FIX} for some seconds", _TAKE_OVER),
+          f"it restarts at once; {_NO_FIX} for 2 to 10 s", _TAKE_OVER),
     event(A.COMPANION_WAITS, CRITICAL, "companion {how} ({what}), again in {seconds:.0f} s",
           {"how": ProcessFault, "what": "name", "seconds": "s"},
-          "with `--supervised`: the flight process died or hung five times in 5 min, and no "
-          "standby is ready",
-          f"it restarts after N (2 to 30 s); {_NO_FIX} until then", _TAKE_OVER),
+          "as `companion_restarts` (HOW, WHAT), but five times in 5 min, and no standby is ready",
+          f"it restarts after N (2 to 30 s); {_NO_FIX} for about 10 s more", _TAKE_OVER),
     event(A.DEPLOYMENT_LOST, WARNING, "deployment file lost, flown as before", {},
           "at a restart after a crash the deployment file cannot be used",
-          "the settings from before the crash are used",
+          "the earlier settings are used",
           "after landing read events.csv; check file and disk"),
     event(A.VIDEO_SENDER_IGNORED, WARNING, "video of {host} ignored", {"host": "name"},
           "UDP: video arrives from another address than `camera.settings.sender` or, if not set, "
-          "the first sender", f"it is ignored; if it is the only one, {_NO_FIX}",
+          "the first sender; each once", f"it is ignored; if it is the only one, {_NO_FIX}",
           "set `camera.settings.sender` to your camera's address"),
     condition(A.ZOOM_UNKNOWN, WARNING, "zoom unknown, no fixes: no CAMERA_SETTINGS", {},
               "CAMERA_SETTINGS is missing in the 2 s before a frame; again every 10 s", WHILE,
@@ -152,7 +152,7 @@ TARGETS: tuple[AlertSpec, ...] = (
           "to over 50 m only)", _NO_TARGET, _CLICK),
     event(A.TARGET_UNREADABLE, WARNING, "target {number} refused: map unreadable?", _NUMBER,
           "an error while a click's position is computed", _NO_TARGET,
-          "click again; after landing read the log"),
+          f"{_CLICK}; after landing read the log"),
     event(A.NO_TARGET, WARNING, "no target: {why}", {"why": ClickRefusal},
           "the clicked frame has no position within 2 s (*not known*), or its status is not "
           "`tracking` (*not confirmed yet*)",
@@ -174,8 +174,7 @@ TARGETS: tuple[AlertSpec, ...] = (
               "its last position is reported as hidden, with growing sigma",
               "look at the video, and click again"),
     condition(A.TARGET_HELD, INFO, "target {number}: kept, its look has changed", _NUMBER,
-              "a standing target is not seen for 3 s, after a slow change of its image; once for "
-              "each target",
+              "a standing target is not seen for 3 s, after a slow change of its image; once each",
               "it looks as before (no text), or the target ends",
               "its position is kept and reported",
               NOTHING),
@@ -183,14 +182,14 @@ TARGETS: tuple[AlertSpec, ...] = (
           "after `target_may_have_left` it looks as before", "the target has not moved", NOTHING),
     condition(A.TARGET_SILENT, WARNING, "{name} not reported: {why}",
               {"name": "name", "why": "name"},
-              "a detected and reported target's position is rejected for 2 s (WHY); one such text "
-              "in 10 s at most", WHILE, "the target is neither sent nor shown", NOTHING),
+              "a detected and reported target's position is rejected for 2 s (WHY); one text in "
+              "10 s at most", WHILE, "the target is neither sent nor shown", NOTHING),
 )  # fmt: skip
 CONSOLE: tuple[AlertSpec, ...] = (
     event(A.CONSOLE_STOP, NOTICE, "targets ended", {},
           "the operator ends the targets in the console",
           "all clicked targets, also a ground station's, are deleted; the detector's stay",
-          "if this was a mistake, click again", lead=_CONSOLE),
+          "if by mistake, click again", lead=_CONSOLE),
     event(A.CONSOLE_TARGET, NOTICE, "target at {x:.2f} {y:.2f}", {"x": "", "y": ""},
           "the operator clicks into the console's video",
           "a target is requested at these shares of width and height; `target_found` or a refusal "

@@ -66,7 +66,8 @@ INJECTION: tuple[AlertSpec, ...] = (
               "turned over 3.5 deg unlike the gyros (without a good fix for 60 s: is over 3.5 deg "
               "off the autopilot's)",
               "five fixes in a row are within 70 % of the limits",
-              "compass, camera mounting or map is rotated; N: vision minus autopilot",
+              "compass, camera mounting or map is rotated; N: vision minus autopilot, small if "
+              "only the turn is wrong",
               f"{_TAKE_OVER}; check compass and camera mounting", lead=_NOT_SENT),
     condition(A.INHIBITED, WARNING, "{alert}", {"alert": A},
               "an alert that inhibits (ALERT) prevents injection in mode inject, although fixes "

@@ -57,11 +57,11 @@ VEHICLE: tuple[AlertSpec, ...] = (
           f"{_TAKE_OVER}"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
           "UDP: MAVLink arrives from another host or port than `bridge.sender` or, if not set, the "
-          "first autopilot (`bridge.ground_connection`: the first ground station); SENDER: its "
-          "host; each once, four at most",
+          "first autopilot (`bridge.ground_connection`: the first ground station, until it is "
+          "silent for 10 s); SENDER: its host; each once, four at most",
           "it is ignored; if it is the autopilot's, no fix reaches it",
           "set `bridge.sender` to the autopilot's address; find the sender, perhaps another port "
-          "of the autopilot's host"),
+          "of its host"),
     event(A.GIMBAL_IGNORED, WARNING, "gimbal {component}, device {device} ignored",
           {"component": "id", "device": "id"}, "a second gimbal reports its attitude; once",
           "only the first gimbal's angles are used, while it sends",
@@ -95,7 +95,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "check the link to the flight controller",
               "TIMESYNC is answered again"),
     event(A.ORIGIN_REFUSED, WARNING, "EKF origin refused: {metres:.0f} m off", {"metres": "m"},
-          "GPS_GLOBAL_ORIGIN changes while armed; once",
+          "GPS_GLOBAL_ORIGIN changes by N while armed; once",
           "fixes stay relative to the previous origin; somebody may forge the message",
           _SIGN),
     event(A.ORIGIN_MOVED, INFO, "EKF origin moved; positions follow it", {},
@@ -112,7 +112,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "AUTOPILOT_VERSION names neither ArduPilot 4.5 or newer nor PX4 1.15 or newer; "
               "its end is not sent",
               WHILE, "fixes are sent with the most cautious settings",
-              "check the firmware's version"),
+              "check its version"),
     condition(A.MESSAGE_UNSUPPORTED, WARNING, "unsupported: {message}", {"message": "name"},
               "the firmware does not support `bridge.injection.message`", WHILE,
               "the EKF cannot use what is sent", f"{_TAKE_OVER}; set another message"),
@@ -146,7 +146,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "a command to point the gimbal cannot be carried out", _AS_BEFORE,
           "correct what the text names"),
     event(A.LOOK_AT_NO_TARGET, WARNING, "look-at refused: no target {number}", {"number": ""},
-          "a command points the gimbal at a target that does not exist", _AS_BEFORE,
+          "a command names a target that does not exist", _AS_BEFORE,
           "give the number of a target"),
     event(A.LOOK_AT_UNANSWERED, WARNING, "autopilot does not answer look-at", {},
           "the autopilot does not answer the gimbal command for 3 s", "the gimbal may not move",
@@ -173,5 +173,5 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "searches of the next 2 min look within 2 N", NOTHING),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
           "the given position is over two of its sigmas off the map",
-          "the search continues without it", "give a position on the map"),
+          "the search ignores it", "give a position on the map"),
 )  # fmt: skip

@@ -66,7 +66,7 @@ class Connection:
             self._link.close()
 
     def send(self, message: Any) -> None:
-        """Send one message."""
+        """Send one message, after `open`; OSError if the vehicle closed the link."""
         with self._send_lock:
             self._link.mav.send(message)
 
@@ -80,7 +80,7 @@ class Connection:
             )
 
     def receive(self) -> list[Any]:
-        """Messages received, after waiting up to 0.1 s."""
+        """Messages received, after waiting up to 0.1 s; none from a closed link, or OSError."""
         port = self._link.port
         if port.fileno() < 0 or not select.select([port], [], [], 0.1)[0]:
             return []

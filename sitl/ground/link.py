@@ -1,7 +1,7 @@
 """Ground station link: commands, parameters, and waiting for conditions.
 
-One thread reads the vehicle's first serial port and time-stamps what it receives. Calls block until
-the vehicle has answered.
+One thread reads the vehicle's first serial port and time-stamps what it receives. Calls other than
+`send` block until the vehicle has answered.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ class GroundLink:
             raise PilotError(f"the vehicle was silent during {what}") from None
 
     def send(self, message: Any) -> None:
-        """Send one message."""
+        """Send a message from any thread, after `connect`; OSError once the link is closed."""
         self._connection.send(message)
 
     # --- the reading thread ------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Scripted ground station for either simulated vehicle, with a record of the true motion.
 
-Calls block until the vehicle has executed or refused the command. Seconds are simulated; true
-states and gimbal angles are looked up by CLOCK_MONOTONIC.
+Calls block until the vehicle has executed the command; `PilotError` if it refuses or stays silent.
+Seconds are simulated; true states and gimbal angles are looked up by CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Pilot:
         )
 
     def set_mode(self, name: str) -> None:
-        """Change the mode and wait until the heartbeat reports it."""
+        """Change the mode, one of `MODES`, and wait until the heartbeat reports it."""
         numbers = PX4_MODES[name] if self.record.is_px4 else (MODES[name],)
         self.link.command(mavlink.MAV_CMD_DO_SET_MODE, 1, *numbers)
         self.link.wait(lambda: self.record.mode == name, _SHOWN_S, f"mode {name}")

@@ -8,6 +8,8 @@ from itertools import pairwise
 
 import pytest
 
+from benchmarks.common.named_errors import named_errors
+from localizer.errors import ModelError
 from tests.benchmarks.commands import COMMANDS
 
 
@@ -72,3 +74,14 @@ def test_every_option_is_explained(name, monkeypatch, capsys):
     ]
     explained = [a.strip() for a, b in pairwise(options) if b.startswith("      ")]
     assert not set(alone) - set(explained)
+
+
+# --- What a benchmark says of bad input ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [ModelError("a.onnx: no"), FileNotFoundError("a.csv")])
+def test_a_named_error_is_one_line(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended, named_errors():
+        raise error
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"{type(error).__name__}: {error}\n"

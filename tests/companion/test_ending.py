@@ -120,7 +120,6 @@ def test_a_record_whose_disk_stands_still_gets_no_maps_of_its_targets(hang, tmp_
     keeper = RecordKeeper(FRAME, lambda _: None)
     config: Any = None
     keeper.open(config, RecordConfig(folder=tmp_path / "flight"), lambda _: None)
-    assert keeper.recorder is not None
     disk: Any = type("Disk", (), {"position_world": property(hang)})()
     keeper.recorder.target(disk)
     assert hang.reached.wait(60.0)

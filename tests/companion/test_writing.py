@@ -1,17 +1,34 @@
 """A result never replaces what was given to be read."""
 
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.errors import FootageError, ReportError
+from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from companion.recorded.autopilot_log import read_autopilot_log
+from companion.redaction import redacted
+from companion.sources import SourceSettings, StreamState, open_source
+from companion.targets.detections import Detection, parse_detection
 from companion.writing import refuse_input, result_file
+from localizer.evaluation.metrics import LocalizationMetrics
+from localizer.evaluation.sequences import CSV_COLUMNS
+from localizer.geometry.camera import Camera
 from localizer.geometry.posefile import read_poses
+from localizer.tracking.engine_health import EngineHealth
+from localizer.types import TrackingState
+from mavlink_bridge.messages import HealthLevel
 
 
 def test_a_result_is_no_input_has_its_suffix_and_lies_beside_a_cache(tmp_path):
@@ -75,3 +92,107 @@ def test_what_is_no_dataflash_log_is_named_in_one_line(tmp_path, capfd, content,
     with pytest.raises(FootageError, match=why):
         read_autopilot_log(log, None)
     assert capfd.readouterr().err == ""
+
+
+# --- docs/reference/formats.md says what the code writes and reads ------------------------------
+
+
+TEXT = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "formats.md").read_text(
+    encoding="utf-8"
+)
+
+
+def _section(begin, end):
+    return TEXT[TEXT.index(begin) : TEXT.index(end, TEXT.index(begin) + 1)]
+
+
+def _codes(text):
+    return re.findall(r"`([^`\n]+)`", text)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "columns"),
+    [
+        ("**estimates.csv**", "**targets.csv**", ESTIMATE_COLUMNS),
+        ("**targets.csv**", "**events.csv**", TARGET_COLUMNS),
+        ("**events.csv**", "**snapshots/", EVENT_COLUMNS),
+        ("| values of `frames.csv` |", "## Trajectory", ("frames.csv", *CSV_COLUMNS)),
+    ],
+)
+def test_columns_stand_in_their_order(begin, end, columns):
+    found = [c for c in _codes(_section(begin, end)) if c in columns]
+    assert tuple(found) == columns
+
+
+def test_what_json_files_hold():
+    report = _section("| values of `report.json` |", "| values of `frames.csv` |")
+    assert {f.name for f in dataclasses.fields(LocalizationMetrics)} <= set(_codes(report))
+    health = set(_codes(_section("**health.json**", "**.tlog**")))
+    assert {f.name for f in dataclasses.fields(EngineHealth)} <= health
+    assert {level.value for level in HealthLevel} <= health
+    assert {state.value for state in TrackingState} <= set(_codes(TEXT))
+
+
+def test_the_example_of_a_detection_is_one():
+    example = re.search(r"```json\n(.*?)\n```", TEXT, re.DOTALL)
+    detection, _ = parse_detection(example.group(1).encode())
+    assert detection == Detection(**json.loads(example.group(1)))
+
+
+# --- No password in what is logged, told or recorded --------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("rtsp://admin:s3cret@10.0.0.2:554/live", "rtsp://***@10.0.0.2:554/live"),
+        ("rtsp://admin:p@ss/w0rd@10.0.0.2/live", "rtsp://***@10.0.0.2/live"),
+        ("refused: 'rtsp://a:b@c/d'; again", "refused: 'rtsp://***@c/d'; again"),
+        ("rtsp://c/d?user=admin&password=x", "rtsp://c/d?user=***&password=***"),
+        ("udp://10.0.0.1:5600 and me@example.org", "udp://10.0.0.1:5600 and me@example.org"),
+        ("udp://@239.1.1.1:5600", "udp://@239.1.1.1:5600"),
+    ],
+)  # fmt: skip
+def test_credentials_are_hidden_and_nothing_else(text: str, shown: str) -> None:
+    assert redacted(text) == shown
+
+
+def test_a_feed_never_tells_its_password(caplog: pytest.LogCaptureFixture) -> None:
+    told: list[str] = []
+    source: Any = None
+
+    def on_state(state: StreamState, text: str) -> None:
+        told.append(text)
+        if state is StreamState.STALLED:
+            source.close()
+
+    url = "rtsp://admin:s3cret@127.0.0.1:9/none"
+    source = open_source(url, Camera.from_fov(320, 240, 70.0), SourceSettings(), on_state)
+    assert list(source.frames()) == []
+    assert any("***@127.0.0.1" in text for text in told)
+    assert "s3cret" not in "".join(told) + caplog.text
+
+
+@pytest.fixture
+def umask() -> Iterator[None]:
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("umask")
+def test_what_a_flight_writes_is_not_for_everybody(tmp_path, monkeypatch):
+    class Flying:
+        def __init__(self, *_: object, **__: object) -> None:
+            (tmp_path / "record").mkdir()
+
+        def run(self) -> None:
+            (tmp_path / "record" / "events.csv").write_text("x")
+
+    monkeypatch.setattr("companion.flight.standby.Companion", Flying)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    deployment = Path(__file__).parents[2] / "configs" / "deployment.yaml"
+    result = CliRunner().invoke(app, ["run", str(deployment)])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "record").stat().st_mode & 0o777 == 0o750
+    assert (tmp_path / "record" / "events.csv").stat().st_mode & 0o777 == 0o640

@@ -63,13 +63,11 @@ class Example:
             self.lines.append(line.rstrip("\n"))
 
     def write(self, line: str) -> None:
-        assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
     def end(self) -> int:
         """Its exit code, once its input has ended."""
-        assert self.process.stdin is not None
         self.process.stdin.close()
         code = self.process.wait(60.0)
         self._reader.join(60.0)
@@ -139,7 +137,6 @@ def test_the_ekf_is_where_my_fixes_say(kind: Any, run: Callable[..., Example]) -
             pilot.wait_ready()
             pilot.arm()
             ekf = pilot.record.ekf
-            assert ekf is not None
             assert ekf.location is not None
             north, east, _ = HOME.ned_of(ekf.location)
             assert math.hypot(north - 20.0, east) < 1.0

@@ -121,7 +121,6 @@ def test_an_origin_that_moves_on_the_ground_or_with_a_reboot_is_followed(monkeyp
     flight.say(heartbeat(armed=False))
     flight.say(origin_message(60.0))
     moved = flight.end.origin.origin
-    assert moved is not None
     assert moved.latitude_deg == pytest.approx(HOME[0] + 60.0 * METRE)
     flight.say(heartbeat(armed=True))
     flight.end.origin.forget()  # as a reboot does

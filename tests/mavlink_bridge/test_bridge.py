@@ -335,7 +335,6 @@ def test_cursor_on_target(autopilot: Any, run: Callable[..., Bridge]) -> None:
         bridge.report(report(target_id=9, elsewhere=0.3))
         ambiguous = ElementTree.fromstring(listener.recv(65536))
     point = event.find("point")
-    assert point is not None
     assert float(point.attrib["lat"]) == pytest.approx(HOME[0] + 0.001)
     assert float(point.attrib["hae"]) == pytest.approx(547.0)
     assert (point.attrib["ce"], point.attrib["le"]) == ("2.5", "1.5")

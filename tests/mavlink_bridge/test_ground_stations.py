@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from lxml import etree
-from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport
@@ -112,8 +111,6 @@ def test_the_aircraft_is_sent_once_a_second_and_only_where_it_is_wanted():
             cot.close()
             got = [etree.fromstring(listener.recv(65536)).get("uid") for _ in range(expected + 1)]
             assert got == ["pilot-aircraft-UAS 7"] * expected + ["pilot-target-3"]
-    with pytest.raises(ValidationError, match=r"needs targets\.cot_endpoint"):
-        BridgeConfig(targets={"cot_aircraft": True})
 
 
 def _marks(reports, **targets):
@@ -226,11 +223,6 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
         with pytest.raises(ValueError, match="10 characters"):
             bridge.send_named_values({"VPS_SIGNALS": 1.0})
     station.socket.close()
-
-
-def test_texts_as_the_autopilot_need_a_link_that_does_not_lead_through_it():
-    with pytest.raises(ValidationError, match="texts_as_autopilot needs ground_connection"):
-        BridgeConfig(texts_as_autopilot=True)
 
 
 def test_the_buttons_for_qgroundcontrol_are_commands_that_our_components_take():

@@ -80,7 +80,6 @@ def injected(kind: Any, sent_ns: int = 10 * SECOND + 80 * MS) -> Any:
         sent_ns,
     )
     injection = injector.step(sent_ns, InjectionContext(Origin(*HOME, 488.0), PX4, attitude_at))
-    assert injection is not None
     return injection.message
 
 

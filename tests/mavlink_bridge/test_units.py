@@ -182,7 +182,6 @@ def test_what_is_read_is_in_the_units_of_the_definition() -> None:
     assert local.snapshot(10**9).local_velocity_ned == (4.0, 5.0, 6.0)
     attitude = read("ATTITUDE", {"roll": 10.0, "pitch": 20.0, "yaw": 30.0, "yawspeed": 0.2})
     at = attitude.attitude_at(1001 * 10**6)
-    assert at is not None
     angles = np.degrees([at.roll_rad, at.pitch_rad, at.yaw_rad])
     assert angles == pytest.approx([10, 20, 30], abs=0.05)  # a millisecond on, at 0.2 rad/s
     assert at.rates[2] == pytest.approx(0.2)
@@ -200,6 +199,5 @@ def test_old_gimbal_angles_are_in_the_units_of_the_definition(name, angles):
     for message, time_ns in sent(name, dict(zip(angles, (-45.0, 5.0, 30.0), strict=True))):
         readings.update(message, time_ns)
     sample = readings.gimbals.at(1001 * 10**6)
-    assert sample is not None
     roll, pitch, yaw = np.degrees(quat.to_euler(sample.quaternion))
     assert (pitch, roll, yaw) == pytest.approx((-45.0, 5.0, 30.0), abs=1e-3)

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import io
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ class RangeFile(io.RawIOBase):
         super().__init__()
         self._url, self._client, self._failed = url, client, failed
         self._at = 0
-        self._block = lru_cache(_KEPT_BLOCKS)(self._read_block)
+        self._blocks: OrderedDict[int, bytes] = OrderedDict()
         self._size = 0
         self._block(0)
 
@@ -89,12 +90,19 @@ class RangeFile(io.RawIOBase):
             self._at += len(part)
         return done
 
-    def _read_block(self, number: int) -> bytes:
+    def _block(self, number: int) -> bytes:
+        if number in self._blocks:
+            self._blocks.move_to_end(number)
+            return self._blocks[number]
         try:
-            return self._asked(number)
+            data = self._asked(number)
         except MapFetchError as error:
             self._failed.append(error)
             raise
+        self._blocks[number] = data
+        while len(self._blocks) > _KEPT_BLOCKS:
+            self._blocks.popitem(last=False)
+        return data
 
     def _asked(self, number: int) -> bytes:
         begin = number * _BLOCK

@@ -150,7 +150,7 @@ def _geo_keys(file: BinaryIO) -> dict[int, int]:
 
 
 def flat_crs(crs: CRS) -> CRS:
-    """The horizontal part of a CRS."""
+    """A CRS's horizontal part. The importer converts heights itself, so GDAL must not."""
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     return flat.to_2d() if len(flat.axis_info) == 3 else flat
 

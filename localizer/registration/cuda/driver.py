@@ -103,7 +103,7 @@ class Device:
         return event
 
     def elapsed_ms(self, start: Any, stop: Any) -> float:
-        """Milliseconds of device time between two events."""
+        """Milliseconds of device time from `start` to `stop`, of `event`; waits for `stop`."""
         self._call(self._api.cuEventSynchronize, stop)
         return float(self._call(self._api.cuEventElapsedTime, start, stop))
 

@@ -1,7 +1,7 @@
 """Cells outside the town: fields, woods, meadows, orchards, farms, the riverside.
 
 Each ``plan_`` function fills one cell (i, j) of the street lattice and adds to `planner`.
-outline: (N, 2) of the cell, ENU metres, counter-clockwise.
+outline: of `Lattice.cell`, (N, 2) ENU metres, counter-clockwise.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def plan_meadow(planner: Planner, rng: np.random.Generator, i: int, j: int, outl
 def plan_orchard(
     planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array
 ) -> None:
-    """Fruit trees in rows."""
+    """Fruit trees in rows, up to 55 m from the middle along each axis."""
     angle, middle = main_axis(outline), outline.mean(0)
     c, s = np.cos(angle), np.sin(angle)
     contour = outline.astype(np.float32)

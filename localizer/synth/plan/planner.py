@@ -154,8 +154,8 @@ def frontages(planner: Planner, i: int, j: int) -> list[tuple[Array, Street]]:
 
 
 def main_axis(outline: Array) -> float:
-    """Direction (rad) of the first side of a cell; outline: of `Lattice.cell`."""
-    edge = outline[8] - outline[0]
+    """Direction (rad) of the first of four sides of equally many points, as of `Lattice.cell`."""
+    edge = outline[len(outline) // 4] - outline[0]
     return float(np.arctan2(edge[1], edge[0]))
 
 

@@ -70,7 +70,7 @@ class Lattice:
         return self.warp(p + t * (q - p))
 
     def cell(self, i: int, j: int) -> Array:
-        """Outline (N, 2) of a cell, counter-clockwise."""
+        """Outline (N, 2) of a cell, ENU m, counter-clockwise; equally many points on each side."""
         corners = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1), (i, j)]
         parts = [self.line(p, q)[:-1] for p, q in pairwise(corners)]
         return np.concatenate(parts)

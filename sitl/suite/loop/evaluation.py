@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from mavlink_bridge.alerts.catalogue import spec_of
 from mavlink_bridge.alerts.ids import AlertId
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop.case import Expectation
@@ -68,7 +69,8 @@ class LoopRecord:
 
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`. back:
     restart times after a kill or hang; None without one. shadow: the health at the start of the
-    recorded part; None if injection was forced.
+    recorded part; None if injection was forced. standing: alerts raised before the recorded part
+    and not cleared before it, at_s negative; only of a deployment that is wrong from the start.
     """
 
     samples: tuple[LoopSample, ...]
@@ -78,6 +80,7 @@ class LoopRecord:
     stall_s: float = 0.0
     back: RestartTimes | None = None
     shadow: Health | None = None
+    standing: tuple[Text, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -213,7 +216,7 @@ def evaluate(
         held.append(
             LoopExpectationResult("tracks at the end", ok, last.health if last else "no samples")
         )
-    held += [_reported(record.texts, of) for of in expect.reports]
+    held += [_reported(record, of) for of in expect.reports]
     held += [_timed(record.texts, of) for of in expect.alerts]
     if expect.warns_first is not None:
         held.append(_warned(record.texts, expect.warns_first))
@@ -236,8 +239,17 @@ def _repeated(texts: Sequence[Text], most: int) -> LoopExpectationResult:
     )
 
 
-def _reported(texts: Sequence[Text], of: AlertId) -> LoopExpectationResult:
-    found = [t for t in texts if t.alert is of]
+def standing_alerts(texts: Sequence[Text]) -> tuple[Text, ...]:
+    """The last text of each alert that was raised and not cleared, of those whose end is told.
+    texts: in order of time.
+    """
+    last = {t.alert: t for t in texts if t.alert is not None and spec_of(t.alert).reports_end}
+    return tuple(t for t in last.values() if t.raised is not None)
+
+
+def _reported(record: LoopRecord, of: AlertId) -> LoopExpectationResult:
+    """Check that the operator was told: in the recorded part, or before it with no clearing."""
+    found = [t for t in (*record.standing, *record.texts) if t.raised and t.alert is of]
     at = f"at {found[0].at_s:.1f} s" if found else "never"
     return LoopExpectationResult(f"reports {of.words}", bool(found), at)
 

@@ -33,7 +33,7 @@ from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import CpuLoad
-from sitl.suite.loop.evaluation import LoopRecord, LoopSample, RestartTimes
+from sitl.suite.loop.evaluation import LoopRecord, LoopSample, RestartTimes, standing_alerts
 from sitl.suite.loop.terrain_file import terrain_file
 from sitl.suite.ramp import RunningRamp
 from sitl.suite.record import Text
@@ -187,19 +187,21 @@ class _LoopFlight:
 
     def record(self) -> LoopRecord:
         """The data for the expectations; call it after the processes have ended."""
-        texts = tuple(
+        texts = [
             Text((t.time_ns - self._start_ns) * 1e-9, t.component, t.severity, t.text)
             for t in self._pilot.record.texts
-            if self._start_ns <= t.time_ns <= self._end_ns
-        )
+            if t.time_ns <= self._end_ns
+        ]
+        before = [t for t in texts if t.at_s < 0.0]
         return LoopRecord(
             self._with_errors(),
-            texts,
+            tuple(t for t in texts if t.at_s >= 0.0),
             tuple(self._fix_errors()),
             slowest_pace(self._ticks),
             longest_stall(self._ticks),
             self._back(),
             self._shadow,
+            standing_alerts(before) if self._case.wrong != DeploymentErrors() else (),
         )
 
     # --- before ----------------------------------------------------------------------------------

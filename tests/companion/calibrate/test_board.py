@@ -13,12 +13,16 @@ from typer.testing import CliRunner
 
 from companion.calibrate.board import ACROSS, DOWN, board_picture, write_sheet
 from companion.calibrate.lens import solve_lens
+from companion.calibrate.pictures import PictureReader
 from companion.calibrate.views import BoardViews
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.errors import RecordError, ReportError
+from localizer.features.detail import DetailExtractor
+from localizer.features.gradient import GradientExtractor
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import matrix_from_euler
+from localizer.geometry.pose import Pose, matrix_from_euler
+from localizer.types import Frame, RenderedView
 
 TRUE = Camera(640, 480, 505.0, 503.0, 327.0, 236.0, (-0.11, 0.03, 0.0007, -0.0004, 0.0))
 DOTS = 40
@@ -153,3 +157,45 @@ def test_the_command_reads_a_folder_and_changes_the_deployment(tmp_path):
     assert after.fx == pytest.approx(TRUE.fx, rel=0.01)
     assert len(list((tmp_path / "k").glob("*.png"))) == 12
     assert (tmp_path / "deployment.yaml.before-calibration").exists()
+
+
+# --- A picture through a longer lens than the deployment's, laid on the map part by part --------
+
+
+CAMERA = Camera.from_fov(320, 240, 65.0)
+
+
+class Plane:
+    """A renderer of one textured plane 100 m below, whatever it is asked."""
+
+    def __init__(self, depth_m: float = 100.0) -> None:
+        self.depth_m = depth_m
+        noise = np.random.default_rng(3).normal(size=(240, 320, 3)).astype(np.float32)
+        smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
+        self.rgb = np.clip(128 + 400 * smooth, 0, 255).astype(np.uint8)
+
+    def render(self, pose, camera, extra=(), *, wait=False):
+        return RenderedView(self.rgb, np.full((240, 320), self.depth_m, np.float32), pose, camera)
+
+
+@pytest.mark.parametrize("longer", [1.0, 1.008])
+def test_each_part_is_found_where_the_picture_has_it(longer):
+    plane = Plane()
+    middle = np.array([CAMERA.cx - 0.5, CAMERA.cy - 0.5])
+    scale = np.hstack([longer * np.eye(2), ((1 - longer) * middle)[:, None]])
+    image = cv2.warpAffine(plane.rgb, scale, (320, 240), flags=cv2.INTER_LINEAR)
+    reader = PictureReader(plane, DetailExtractor(GradientExtractor()), CAMERA, 320)
+    pose = Pose.identity()
+    parts = reader.read(Frame(image, 0, CAMERA, 0), pose, None)
+    assert len(parts.points) > 40
+    expected, _ = CAMERA.project(parts.points)
+    expected = (expected - (CAMERA.cx, CAMERA.cy)) * longer + (CAMERA.cx, CAMERA.cy)
+    off = np.hypot(*(parts.pixels - expected).T)
+    assert np.median(off) < 0.1
+    assert np.percentile(off, 90) < 0.3
+
+
+def test_a_view_beside_the_map_gives_nothing():
+    plane = Plane(depth_m=0.0)
+    reader = PictureReader(plane, DetailExtractor(GradientExtractor()), CAMERA, 320)
+    assert reader.read(Frame(plane.rgb, 0, CAMERA, 0), Pose.identity(), None) is None

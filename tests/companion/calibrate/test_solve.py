@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from numpy.typing import NDArray
 
 from companion.calibrate import unknowns as u
 from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
 from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
-from companion.calibrate.flight import CalibrationResult
+from companion.calibrate.flight import CalibrationResult, receiver_bias_m
 from companion.calibrate.pictures import Parts
 from companion.calibrate.proposal import (
     SettingChange,
@@ -23,12 +24,13 @@ from companion.calibrate.proposal import (
     write_changed,
 )
 from companion.calibrate.solve import solve
+from companion.calibrate.spatial_correlation import ImageNormalEquations, images_covariance
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
-from localizer.geometry.pose import Pose, matrix_from_euler, so3_exp
+from localizer.geometry.pose import Array, Pose, matrix_from_euler, so3_exp
 
 TOLD = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (-0.09, 0.02, 0.0, 0.0, 0.0))
 ERRORS = np.zeros(u.COUNT)
@@ -177,3 +179,58 @@ def test_another_flights_deployment_is_not_written_over(rich: CalibrationResult,
     write_changed(path, remounted, "mounted anew")
     with pytest.raises(ConfigError, match=r"mount_pitch_deg is -8.0, .* flown with 0.0"):
         require_flown_with(path, wanted)
+
+
+# --- What a calibration says of the receiver under whose places it was made ---------------------
+
+
+def test_a_receivers_error_is_of_the_whole_flight_and_not_of_its_last_picture() -> None:
+    """It said 3 m for two minutes and 0.6 m at the end: the last alone is 5 times too sure."""
+    assert receiver_bias_m([3.0] * 120 + [0.6]) == pytest.approx(2.98, abs=0.01)
+    assert receiver_bias_m([0.6] * 120 + [3.0]) == pytest.approx(0.62, abs=0.01)
+
+
+def test_a_receiver_that_says_little_or_nothing_is_not_believed_to_be_perfect() -> None:
+    assert receiver_bias_m([]) == receiver_bias_m([None, 0.01]) == 0.5
+
+
+# --- Pictures of the same ground err alike: a hundred of ten places are no hundred --------------
+
+
+PICTURES, PLACES = 240, 24
+
+
+def larger(pulls: Array, grounds: Array) -> float:
+    """Of one number that each picture tells with information 1, whatever its pose."""
+    K = len(pulls)
+    normals = ImageNormalEquations(
+        np.tile(np.eye(6), (K, 1, 1)), np.zeros((K, 6, 1)), np.ones((K, 1, 1)), np.zeros((K, 6)),
+        pulls[:, None],
+    )  # fmt: skip
+    gain = np.zeros((1, 1 + 6 * K))
+    gain[0, 0] = 1.0 / K
+    alone, factor = images_covariance(gain, 1, normals, grounds)
+    assert alone[0, 0] == pytest.approx(1.0 / K)
+    return float(factor[0])
+
+
+def places(rng: np.random.Generator) -> tuple[NDArray[np.intp], Array]:
+    """Each picture's place, and what it shows, m: ten of each place, legs apart in time."""
+    of: NDArray[np.intp] = np.arange(PICTURES) % PLACES
+    middles = np.stack([300.0 * (np.arange(PLACES) % 5), 300.0 * (np.arange(PLACES) // 5)], axis=1)
+    return of, middles[of] + rng.uniform(-5.0, 5.0, (PICTURES, 2))
+
+
+def test_pictures_that_err_for_themselves_are_believed():
+    rng = np.random.default_rng(1)
+    _, grounds = places(rng)
+    pulls = rng.normal(0.0, 1.0, PICTURES)
+    assert larger(pulls - pulls.mean(), grounds) < 1.35
+
+
+def test_those_of_the_same_ground_that_err_alike_count_once_whenever_they_were_taken():
+    rng = np.random.default_rng(2)
+    of, grounds = places(rng)
+    pulls = rng.normal(0.0, 1.0, PLACES)[of]
+    factor = larger(pulls - pulls.mean(), grounds)
+    assert factor == pytest.approx(np.sqrt(PICTURES / PLACES), rel=0.35)

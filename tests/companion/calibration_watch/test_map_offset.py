@@ -90,7 +90,6 @@ def test_a_shifted_map_is_told_once_and_changes_nothing() -> None:
     assert len(flight.said) == 1
     assert flight.said[0].values[0] == pytest.approx(3.4, abs=0.5)
     assert flight.said[0].values[1:] == ("east", "")
-    assert shift.shift is not None
     assert shift.shift.ne_m == pytest.approx((0.1, 3.4), abs=1.0)
     assert flight.error(2000) == pytest.approx(3.4, abs=0.5)
     report = shift.report()

@@ -1,20 +1,28 @@
 """The command line as a process: what an operator sees of wrong input and of an interrupt."""
 
+from __future__ import annotations
+
 import re
 import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.errors import ConfigError, ReportError
 from companion.writing import make_folder
-from mavlink_bridge.errors import TlogError
+from mavlink_bridge.errors import BridgeStateError, TlogError
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.link.signing import load_key
+from tests.companion.test_config import MINIMAL
+from tests.mavlink_bridge.conftest import FakeAutopilot
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
 START_S = 400.0  # of a process, on a busy machine that compiles everything anew
@@ -158,3 +166,84 @@ def test_an_option_that_is_no_finite_number_is_named(tmp_path, options):
     result = CliRunner().invoke(app, ["try", str(tmp_path), *options])
     assert isinstance(result.exception, ConfigError)
     assert re.fullmatch("--fov (nan|inf): give a finite number", str(result.exception))
+
+
+# --- ``companion key``: a key is made once, and given to a disarmed vehicle only ----------------
+
+
+class Vehicle(FakeAutopilot):
+    """Takes SETUP_SIGNING as ArduPilot does, and signs from then on."""
+
+    armed = False
+
+    def send(self, message: Any, component: int = 1, system: int = 1) -> None:
+        if self.armed and message.get_type() == "HEARTBEAT":
+            message.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        super().send(message, component, system)
+
+    def answer(self, m: Any) -> None:
+        if m.get_type() != "SETUP_SIGNING":
+            super().answer(m)
+            return
+        signing = self.codec.signing
+        if signing.secret_key is None:
+            signing.secret_key, signing.sign_outgoing = bytes(m.secret_key), True
+            signing.timestamp = m.initial_timestamp
+
+
+def test_a_key_is_made_for_its_owner_and_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "mavlink.key"
+    result = CliRunner().invoke(app, ["key", str(path)])
+    assert result.exit_code == 0, result.output
+    key = load_key(path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    again = CliRunner().invoke(app, ["key", str(path)])
+    assert isinstance(again.exception, ConfigError)
+    assert load_key(path) == key
+    assert key.hex() not in result.output
+
+
+def test_a_connection_that_is_none_is_told_before_a_key_is_made(tmp_path: Path) -> None:
+    path = tmp_path / "mavlink.key"
+    result = CliRunner().invoke(app, ["key", str(path), "--install", "pigeon:1"])
+    assert isinstance(result.exception, ConfigError)
+    assert "--install pigeon:1" in str(result.exception)
+    assert not path.exists()
+
+
+def test_the_vehicle_signs_with_the_installed_key(tmp_path: Path) -> None:
+    path, vehicle = tmp_path / "mavlink.key", Vehicle()
+    try:
+        where = f"udpout:127.0.0.1:{vehicle.port}"
+        result = CliRunner().invoke(app, ["key", str(path), "--install", where])
+        assert result.exit_code == 0, result.output
+        assert "heartbeat is signed" in result.output
+        assert vehicle.codec.signing.secret_key == load_key(path)
+    finally:
+        vehicle.stop()
+
+
+def test_an_armed_vehicle_is_given_no_key(tmp_path: Path) -> None:
+    path, vehicle = tmp_path / "mavlink.key", Vehicle()
+    vehicle.armed = True
+    try:
+        where = f"udpout:127.0.0.1:{vehicle.port}"
+        result = CliRunner().invoke(app, ["key", str(path), "--install", where])
+        assert isinstance(result.exception, BridgeStateError)
+        assert "disarm" in str(result.exception)
+        assert not vehicle.of("SETUP_SIGNING")
+    finally:
+        vehicle.stop()
+
+
+# --- What a command is doing goes to standard error, what it found to standard output -----------
+
+
+def test_doctors_table_stands_alone_on_standard_output(tmp_path: Path) -> None:
+    file = tmp_path / "d.yaml"
+    file.write_text(yaml.safe_dump(MINIMAL | {"map": str(tmp_path / "none")}))
+    done = CliRunner().invoke(app, ["doctor", str(file), "--beside-flight"])
+    assert done.exit_code == 2
+    assert "NOT fit to fly" in done.stdout
+    assert "examining" not in done.stdout
+    assert "examining" in done.stderr

@@ -21,7 +21,13 @@ from companion.flight.recorder import ESTIMATE_COLUMNS
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
-from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera, write_poses
+from localizer.geometry.posefile import (
+    PoseRow,
+    pose_row,
+    read_poses,
+    world_from_camera,
+    write_poses,
+)
 
 ORIGIN = Geodetic(47.3, 8.5, 450.0)
 FRAME = LocalFrame(ORIGIN)
@@ -376,3 +382,21 @@ def test_a_map_or_an_origin_is_needed(poses, tmp_path):
     with pytest.raises(ConfigError, match="either --map or --origin"):
         _convert(poses, tmp_path / "x", "--from", "poses", "--to", "colmap", "--map", tmp_path,
                  *PLACE)  # fmt: skip
+
+
+# --- The tables of angles.md say what the conversions say ---------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gimbal", "row"),
+    [
+        ((0, -40, 60), (0, 50, -60)),  # the figure's
+        ((0, -90, 0), (0, 0, 0)),  # straight down, the picture's top to the north
+        ((0, 0, -90), (0, 90, 90)),  # level, to the west
+    ],
+)
+def test_the_tables_zeros_and_signs(gimbal, row):
+    place = Geodetic(47.3, 8.5, 500.0)
+    level = AutopilotAngles("", None, place, Angles(0.0, 0.0, 0.0), Angles(*gimbal))
+    found = pose_row("", pose_of_autopilot(level, LocalFrame(place)), LocalFrame(place))
+    assert (found.roll_deg, found.pitch_deg, found.yaw_deg) == pytest.approx(row, abs=1e-9)

@@ -1,14 +1,28 @@
 """The table of parts: made and started in order, undone in the reverse, whatever fails."""
 
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import yaml
 
-from companion.config import parse_config
+from companion.config import load_config, parse_config
+from companion.conversions import CameraExtrinsics
 from companion.flight.channels import Channel
 from companion.flight.component_table import COMPONENTS
-from companion.flight.components import Assembly, Component
+from companion.flight.components import Assembly, BuildContext, Component
+from companion.flight.feed import Feed
+from companion.flight.injection import FixInjection
+from companion.inertial import InertialTrack
+from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
+from mavlink_bridge.bridge import Bridge
 
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
 
@@ -131,3 +145,79 @@ def test_every_subscriber_is_served_though_one_fails():
     with pytest.raises(ValueError, match="boom"):
         channel.send(1)
     assert taken == [1]
+
+
+# --- What the table's parts are made of a deployment as it comes --------------------------------
+
+
+def _given(one: Any, _: BuildContext) -> Any:
+    return one
+
+
+def test_the_guardian_is_made_of_a_deployment_in_a_folder_whose_name_is_no_utf8(tmp_path: Path):
+    """No flight began there: what the monitor remembers is of the camera, by its film's path."""
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/fl\xfcge"))
+    folder.mkdir()
+    deployment = folder / "companion.yaml"
+    camera = {"source": "film.mp4", "model": MODEL}
+    record = {"folder": "record"}
+    deployment.write_text(yaml.safe_dump({"map": "m", "camera": camera, "record": record}))
+    stand_ins = {
+        Bridge: object(), CameraExtrinsics: object(), InertialTrack: object(),
+        FixInjection: SimpleNamespace(add_check=lambda _: None, add_observer=lambda _: None),
+    }  # fmt: skip
+    parts: list[Component[Any]] = [
+        Component(kind.__name__, kind, partial(_given, one)) for kind, one in stand_ins.items()
+    ]
+    assembly = Assembly(
+        load_config(deployment), [*parts, *(p for p in COMPONENTS if p.kind is IntegrityMonitor)]
+    )
+    with ExitStack() as up:
+        assembly.make(up)
+        assert assembly.get(IntegrityMonitor) is not None
+
+
+# --- The feed hands frames on, whatever becomes of them -----------------------------------------
+
+
+class Source:
+    """Three frames; then its regular end, or an error."""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self._error = error
+
+    def frames(self) -> Iterator[Any]:
+        yield from range(3)
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        pass
+
+
+def fed(source: Source, take: Any) -> Feed:
+    feed = Feed(source, take)  # type: ignore[arg-type]
+    feed.start()
+    assert feed.ended.wait(20.0)
+    feed.stop()
+    return feed
+
+
+def test_a_part_that_fails_on_a_frame_does_not_end_the_flight(caplog):
+    """One picture that the console or a recorder could not take ended the process in the air."""
+    taken: list[int] = []
+
+    def take(frame: int) -> None:
+        taken.append(frame)
+        if frame < 2:
+            raise ValueError(f"frame {frame}")
+
+    feed = fed(Source(), take)
+    assert taken == [0, 1, 2]
+    assert feed.error is None
+    assert feed.failures == 2
+    assert len([r for r in caplog.records if "a part failed" in r.getMessage()]) == 1
+
+
+def test_what_ends_the_source_is_kept() -> None:
+    assert isinstance(fed(Source(OSError("gone")), lambda _: None).error, OSError)

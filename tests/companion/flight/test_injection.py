@@ -1,17 +1,31 @@
 """Which estimates become fixes, which of them carries a jump, and who may withhold one."""
 
+from __future__ import annotations
+
+import math
+import threading
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from companion.conversions import CameraExtrinsics
+from companion.calibration_watch.observation import CalibrationObservation
+from companion.conversions import CameraExtrinsics, camera_view, vision_fix
+from companion.flight.calibration_observer import CalibrationObserver, middle_depth_m
 from companion.flight.injection import FixInjection
+from companion.flight.view_reporter import ViewReporter
+from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.types import TrackingState
+from localizer.geometry.pose import Pose, matrix_from_euler
+from localizer.map.cache.pick import BundleHits
+from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
-from tests.companion.estimates import estimated
+from mavlink_bridge.camera.messages import camera_fov_status
+from mavlink_bridge.config import CameraConfig
+from tests.companion.estimates import DOWN, estimated
 
 LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
 DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
@@ -118,3 +132,121 @@ def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
         alert(AlertId.FIXES_NOT_CHECKED), cleared(AlertId.FIXES_NOT_CHECKED),
         alert(AlertId.FIXES_NOT_CHECKED),
     ]  # fmt: skip
+
+
+# --- Which estimates become evidence of the calibration, and what they say ----------------------
+
+
+FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
+EXTRINSICS = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
+
+
+def bundle(depth: np.ndarray) -> Any:
+    return SimpleNamespace(view=SimpleNamespace(depth=depth))
+
+
+def estimate(time_s: float, *, state: str = "TRACKING") -> PoseEstimate:
+    pose = Pose(DOWN, np.array([0.0, 0.0, 80.0]))
+    return estimated(pose, round(time_s * 1e9), variance=0.04, state=TrackingState[state])
+
+
+def test_four_a_second_of_what_the_map_confirmed() -> None:
+    taken: list[CalibrationObservation] = []
+    observer = CalibrationObserver(EXTRINSICS, taken.append)
+
+    def see(seen: PoseEstimate, depth: np.ndarray) -> None:
+        observer.add_fix(seen, bundle(depth), vision_fix(seen, EXTRINSICS, None, None, 1))
+
+    depth = np.full((240, 320), 80.0, np.float32)
+    for tenth in range(1, 21):
+        see(estimate(0.1 * tenth), depth)
+    assert 6 <= len(taken) <= 8
+    see(estimate(6.0, state="BRIDGING"), depth)
+    see(estimate(7.0), np.zeros((240, 320), np.float32))
+    assert taken[-1].time_ns < 5e9
+    one = taken[0]
+    assert one.place == pytest.approx((47.0, 8.0, 580.0), abs=1e-6)
+    assert one.sigma_m == pytest.approx(0.2)
+    assert one.depth_m == 80.0
+    assert one.ned_from_camera[:, 2] == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
+
+
+def test_the_depth_is_that_of_the_ground_in_the_middle() -> None:
+    depth = np.full((240, 320), 500.0, np.float32)
+    depth[60:180, 80:240] = 90.0
+    depth[100:110, 100:110] = 10.0  # a mast
+    assert middle_depth_m(depth) == 90.0
+    depth[60:170] = 0.0
+    assert middle_depth_m(depth) is None
+
+
+# --- What the ground is told about the camera's view --------------------------------------------
+
+
+# OpenCV axes of a camera at the horizon that looks north, in ENU.
+NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def estimate_view_reporter(
+    pitch_deg: float, *, accepted: bool = True, time_ns: int = 5
+) -> PoseEstimate:
+    """100 m above the origin, looking north and `pitch_deg` above the horizon."""
+    rotation = matrix_from_euler(math.radians(pitch_deg), 0.0, 0.0) @ NORTH
+    return estimated(Pose(rotation, np.array([0.0, 0.0, 100.0])), time_ns, accepted=accepted)
+
+
+def flat(origin, directions):
+    distances = np.where(directions[:, 2] < 0.0, -origin[2] / directions[:, 2], np.nan)
+    return BundleHits(distances, np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
+
+
+def test_the_picture_s_centre_falls_on_the_ground():
+    view = camera_view(estimate_view_reporter(-45.0), FRAME, flat)
+    assert (view.latitude_deg, view.longitude_deg) == pytest.approx((47.0, 8.0))
+    assert view.height_m == pytest.approx(600.0, abs=0.01)
+    # 45 deg down from 100 m meets the ground 100 m to the north: 1 deg of latitude is 111.17 km.
+    assert view.image_latitude_deg is not None
+    assert (view.image_latitude_deg - 47.0) * 111_170 == pytest.approx(100.0, abs=0.5)
+    assert view.image_longitude_deg == pytest.approx(8.0, abs=1e-9)
+    assert view.image_height_m == pytest.approx(500.0, abs=0.01)
+    # Nose down about the right-hand axis: (cos, 0, sin, 0) of half the pitch.
+    half = math.radians(-45.0) / 2.0
+    q = np.array(view.quaternion_ned)
+    assert abs(q @ [math.cos(half), 0.0, math.sin(half), 0.0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_field_of_view_is_that_of_the_zoom():
+    zoomed = replace(estimate_view_reporter(-45.0), camera=Camera.from_fov(640, 480, 20))
+    view = camera_view(zoomed, FRAME, flat)
+    sent = camera_fov_status(view, CameraConfig(horizontal_fov_deg=60.0), 0.0, 0)
+    assert (sent.hfov, sent.vfov) == pytest.approx((20.0, zoomed.camera.vertical_fov_deg))
+
+
+def test_a_look_into_the_sky_has_no_ground():
+    view = camera_view(estimate_view_reporter(10.0), FRAME, flat)
+    assert view.image_latitude_deg is None
+    assert view.image_height_m is None
+
+
+def test_only_the_newest_accepted_estimate_is_told_and_errors_do_not_end_it():
+    views, came, failed = [], threading.Event(), threading.Event()
+
+    def cast(origin, direction):
+        if not failed.is_set():
+            failed.set()
+            raise RuntimeError("map is being loaded")
+        return flat(origin, direction)
+
+    def look(view):
+        views.append(view)
+        came.set()
+
+    reporter = ViewReporter(200.0, FRAME, cast, look)
+    reporter.start()
+    reporter.add_estimate(estimate_view_reporter(-45.0))
+    assert failed.wait(30.0)
+    reporter.add_estimate(estimate_view_reporter(-45.0, accepted=False, time_ns=6))
+    reporter.add_estimate(estimate_view_reporter(-45.0, time_ns=7))
+    assert came.wait(30.0)
+    reporter.stop()
+    assert [view.time_ns for view in views] == [7]

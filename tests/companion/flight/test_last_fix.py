@@ -47,7 +47,6 @@ def tracked(time_ns: int) -> PoseEstimate:
 
 def test_the_way_that_the_ekf_flew_since_is_added(tmp_path: Path) -> None:
     prior = memory(kept(tmp_path)).prior(103 * SECOND)
-    assert prior is not None
     # 3 m north, 4 m east, 5 m up: the map's axes are east, north, up.
     assert prior.world_from_camera.translation == pytest.approx([4.0, 3.0, 85.0], abs=0.01)
     assert prior.independent  # it begins tracking without a search
@@ -188,7 +187,6 @@ def test_once_found_the_memory_is_its_own(tmp_path: Path) -> None:
     assert kept_on.prior(105 * SECOND) is None
     while (now := read_last_fix(path, boot_id())) == BEGUN:
         pass
-    assert now is not None
     assert (now.time_ns, now.local_ned) == (104 * SECOND, (1.0, 2.0, 3.0))
     assert FRAME.enu_from_geodetic(
         now.latitude_deg, now.longitude_deg, now.height_m

@@ -94,7 +94,6 @@ def test_an_ekf_that_follows_our_fixes_is_no_evidence_whatever_a_receiver_says_b
     fix: Any = SimpleNamespace(accepted=True, exposure_time_ns=40 * SECOND)
     pose.add_estimate(fix, reaches_ekf=True)
     prior = pose.prior(100 * SECOND)
-    assert prior is not None
     assert not prior.independent
     assert prior.covariance[0, 0] > 100.0**2
 
@@ -105,7 +104,6 @@ def test_an_ekf_on_gnss_begins_the_tracking_and_after_a_restart_where_they_agree
     placed = Placed()
     placed.apart_m = apart_m
     prior = AutopilotPose(placed, INSTALLATION, PriorConfig(), lambda: on_gnss).prior(100 * SECOND)
-    assert prior is not None
     assert prior.independent
     assert prior.covariance[0, 0] == pytest.approx(25.0)
 

@@ -352,7 +352,6 @@ def looking(flight: Flight, yaw_off_deg: float) -> CalibrationObservation:
     """What the map says of a camera that looks 45 degrees down, north but for an angle."""
     now_ns = second(flight.at_s)
     gimbal = flight.gimbal_at(now_ns)
-    assert gimbal is not None
     reported = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     turned = so3_exp(np.array([0.0, 0.0, np.radians(yaw_off_deg)])) @ reported
     return CalibrationObservation(now_ns, (LATITUDE, LONGITUDE, HEIGHT), 0.1, turned, 85.0, 60.0)

@@ -128,6 +128,4 @@ def test_a_tilt_over_a_valley_below_take_off_is_in_the_level() -> None:
             one.monitor.add_observation(sighting(0.1 * tenth, 30.0))
             one.fly(0.1 * tenth)
     tilted, level_one = flight.monitor.level, plain.monitor.level
-    assert tilted is not None
-    assert level_one is not None
     assert tilted.horizontal_m > level_one.horizontal_m + 1.0

@@ -277,8 +277,6 @@ def test_a_reset_that_falls_into_a_blind_time_is_announced_after_it(faulty):
     bridge.fails_at = set()
     integrity_monitor.run_checks()
     passed = integrity_monitor.check(jumped[7])
-    assert before is not None
-    assert passed is not None
     assert passed.reset_count != before.reset_count
 
 

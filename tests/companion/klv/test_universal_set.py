@@ -2,13 +2,16 @@
 
 import struct
 
+import klvdata
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from klvdata.misb0601 import UASLocalMetadataSet
 from stanag4609.klv.local_set import parse_local_set
+from stanag4609.st0601 import decode_uas_local_set
 
 from companion.klv import local_set as tag
+from companion.klv.local_set import checksum, encode
 from companion.klv.universal_set import (
     ANGLE_TO_NORTH,
     OBLIQUITY,
@@ -119,3 +122,88 @@ def test_local_sets_of_other_writers(real_data, clip):
         assert told.keys() == _SHARED
         for number in _SHARED:
             assert read[number] == pytest.approx(float(told[number]), rel=1e-4, abs=1e-3), number
+
+
+# --- The encoder against two independent parsers: klvdata and stanag4609, field by field --------
+
+
+TIME_US = 1_790_000_000_123_456
+FIELDS = {
+    tag.MISSION: "survey 7", tag.IMAGE_SOURCE: "EO", tag.COORDINATES: "WGS-84",
+    tag.PLATFORM_HEADING: 359.5, tag.PLATFORM_PITCH: -12.25, tag.PLATFORM_ROLL: 33.0,
+    tag.SENSOR_LATITUDE: -33.8765432, tag.SENSOR_LONGITUDE: 151.2109876, tag.SENSOR_ALTITUDE: 612.3,
+    tag.HORIZONTAL_FOV: 64.55, tag.VERTICAL_FOV: 39.2, tag.RELATIVE_AZIMUTH: 271.123456,
+    tag.RELATIVE_ELEVATION: -44.987654, tag.RELATIVE_ROLL: 359.9, tag.SLANT_RANGE: 321.654,
+    tag.CENTRE_LATITUDE: -33.8755, tag.CENTRE_LONGITUDE: 151.212, tag.CENTRE_ELEVATION: 455.0,
+    **{tag.FIRST_CORNER_OFFSET + k: (-1) ** k * 0.00123 * (k + 1) for k in range(8)},
+    tag.TARGET_LATITUDE: -33.87551, tag.TARGET_LONGITUDE: 151.21201, tag.TARGET_ELEVATION: 456.0,
+    tag.TARGET_CE90: 1.5, tag.TARGET_LE90: 2.25, tag.SENSOR_HEIGHT: 660.0, tag.CENTRE_HEIGHT: 502.0,
+    **{tag.FIRST_CORNER + k: (-33.8 - 0.01 * k, 151.0 + 0.01 * k)[k % 2] for k in range(8)},
+    tag.PLATFORM_PITCH_FULL: -81.5, tag.PLATFORM_ROLL_FULL: 66.6,
+}  # fmt: skip
+COARSE = {  # half a step of the two-byte fields
+    tag.PLATFORM_HEADING: 0.003, tag.PLATFORM_PITCH: 0.0004, tag.PLATFORM_ROLL: 0.0008,
+    tag.SENSOR_ALTITUDE: 0.16, tag.HORIZONTAL_FOV: 0.0014, tag.VERTICAL_FOV: 0.0014,
+    tag.CENTRE_ELEVATION: 0.16, tag.TARGET_ELEVATION: 0.16, tag.SENSOR_HEIGHT: 0.16,
+    tag.CENTRE_HEIGHT: 0.16, tag.TARGET_CE90: 0.032, tag.TARGET_LE90: 0.032, tag.SLANT_RANGE: 6e-4,
+    **dict.fromkeys(range(26, 34), 1.2e-6),
+}  # fmt: skip
+
+
+def _stanag(packet):
+    return {f.definition.tag: f.value for f in decode_uas_local_set(packet).fields}
+
+
+def _klvdata(packet):
+    (parsed,) = list(klvdata.StreamParser(packet))
+    return {ord(key): item.value.value for key, item in parsed.items.items() if len(key) == 1}
+
+
+@pytest.mark.parametrize("parse", [_stanag, _klvdata])
+def test_an_independent_parser_reads_every_field_back(parse):
+    read = parse(encode(TIME_US, FIELDS))
+    for number, value in FIELDS.items():
+        if isinstance(value, str):
+            assert read[number] == value, number
+        elif number not in (45, 46) or parse is _stanag:
+            assert float(read[number]) == pytest.approx(value, abs=COARSE.get(number, 1e-7)), number
+    assert set(FIELDS) <= set(read)
+
+
+def test_time_version_and_checksum_as_the_parsers_check_them():
+    packet = encode(TIME_US, FIELDS)
+    assert round(_stanag(packet)[tag.TIME].timestamp() * 1e6) == TIME_US
+    assert _stanag(packet)[tag.LOCAL_SET_VERSION] == 8
+    assert packet[16] & 0x80  # long form: more than 127 bytes
+    assert packet.endswith(checksum(packet[:-2]).to_bytes(2, "big"))
+    broken = packet[:40] + bytes((packet[40] ^ 1,)) + packet[41:]
+    with pytest.raises(Exception, match=r"(?i)checksum"):
+        decode_uas_local_set(broken)
+
+
+def test_what_its_tag_cannot_hold_is_left_out_and_a_wrong_tag_is_an_error():
+    outside = {
+        tag.SENSOR_ALTITUDE: 19000.5, tag.PLATFORM_PITCH: 20.5, tag.CENTRE_LATITUDE: float("nan"),
+        tag.FIRST_CORNER_OFFSET: 0.0751, tag.MISSION: "",
+    }  # fmt: skip
+    assert set(_stanag(encode(TIME_US, outside))) == {1, 2, 65}
+    for wrong in ({99: 1.0}, {tag.SENSOR_LATITUDE: "47"}):
+        with pytest.raises(ValueError, match="ST 0601 tag"):
+            encode(TIME_US, wrong)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.floats(-90, 90), st.floats(-180, 180), st.floats(-900, 19000), st.floats(0, 5e6),
+    st.integers(0, 2**63),
+)  # fmt: skip
+def test_any_place_is_read_back_to_half_a_step(latitude, longitude, altitude, distance, time_us):
+    given_fields = {
+        tag.SENSOR_LATITUDE: latitude, tag.SENSOR_LONGITUDE: longitude,
+        tag.SENSOR_ALTITUDE: altitude, tag.SLANT_RANGE: distance,
+    }  # fmt: skip
+    read = _klvdata(encode(time_us % 4_000_000_000_000_000, given_fields))
+    assert float(read[13]) == pytest.approx(latitude, abs=3e-8)
+    assert float(read[14]) == pytest.approx(longitude, abs=6e-8)
+    assert float(read[15]) == pytest.approx(altitude, abs=0.16)
+    assert float(read[21]) == pytest.approx(distance, abs=6e-4)

@@ -17,6 +17,7 @@ import pytest
 from companion.console.flight_source import FlightSource
 from companion.errors import CompanionError
 from companion.live.orders import OrderContext, OrderError, Orders
+from companion.live.pace import RateLimiter
 from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
 from companion.live.publisher import Publisher
 from companion.live.shared import SharedMemoryReader
@@ -368,3 +369,16 @@ def test_alerts_reach_the_console_as_ids_and_their_text():
     document = json.loads(json.dumps(_shown().state(0)[0]))
     assert document["follows"]["reason"] == body(alert(AlertId.EKF_NO_SOURCE))
     assert document["shadow"]["reasons"][0]["id"] == AlertId.SHADOW_NOT_COMPARED.value
+
+
+# --- The rate of pictures on the page is the one that was asked for -----------------------------
+
+
+@pytest.mark.parametrize(("fed_hz", "asked_hz", "sent_hz"), [(10, 6, 6), (10, 15, 10), (30, 6, 6)])
+def test_the_mean_rate_is_what_was_asked_for(fed_hz, asked_hz, sent_hz):
+    pace, sent = RateLimiter(1.0 / asked_hz), 0
+    for i in range(100 * fed_hz):
+        if pace.is_due(1000.0 + i / fed_hz):
+            pace.mark_sent(1000.0 + i / fed_hz)
+            sent += 1
+    assert sent / 100 == pytest.approx(sent_hz, rel=0.02)

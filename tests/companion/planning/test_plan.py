@@ -402,7 +402,6 @@ def test_a_mission_over_the_edge_is_told_with_pictures_and_exit_code_1(tmp_path,
     assert "no map in view" in page
     assert "http" not in page  # nothing is fetched
     track = cv2.imread(str(out / "track.png"))
-    assert track is not None
     red = (abs(track.astype(int) - (40, 40, 198)).max(axis=2) < 12).sum()
     assert red > 500
     assert cv2.imread(str(out / "heat.png")).shape == track.shape

@@ -194,7 +194,6 @@ def test_an_offset_that_others_match_or_chance_is_not_decisive(tmp_path, motion,
     log = read_autopilot_log(write_dataflash(tmp_path / "flight.bin", flown, 60.0))
     for begin in (-3.0, 5.0, 20.0):
         found = find_offset(frames, camera, log.track, (begin, begin + 25.0))
-        assert found is not None
         assert not found.is_decisive, found.text
 
 

@@ -62,7 +62,6 @@ def test_on_rendered_pictures_it_finds_the_lens(small_assets: FlightAssets) -> N
             localizer.set_prior(replace(prior, velocity=np.array([0.0, 10.0, 0.0])))
             for k in range(1, COUNT + 1):
                 seen = camera.expose(k * PERIOD_NS, track)
-                assert seen is not None
                 frame = zoomed(Frame(seen.image, seen.time_ns, CAMERA, k))
                 assert frame is not None
                 estimate = localizer.track(frame)
@@ -95,7 +94,6 @@ class Lens:
         for _ in range(pictures):
             self.time_ns += PERIOD_NS
             frame = self.zoomed(Frame(np.zeros((240, 320, 3), np.uint8), self.time_ns, CAMERA, 0))
-            assert frame is not None
             given = frame.camera.fx / CAMERA.fx
             self.zoomed.learn(estimate(self.time_ns, by_table * self.truth / given))
         assert self.zoomed.factor is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import errno
 import json
 import os
 import signal
@@ -16,7 +17,11 @@ from pathlib import Path
 
 import pytest
 
+from companion.config import CompanionConfig, parse_config
+from companion.flight.feed import Feed
 from companion.supervision.processes import ENDING, Beat, FlightProcess
+from companion.supervision.pulse import Pulse, line
+from companion.supervision.restart import without_lost_disks, write_problem
 from companion.supervision.service_manager import ServiceManager
 from companion.supervision.supervisor import RestartPolicy, Supervisor, exit_code_text, mark_dead
 from mavlink_bridge.alerts.alert import Alert
@@ -498,3 +503,184 @@ def test_the_unit_lets_a_watched_service_start_and_hang_no_longer_than_it_may() 
     # What ends a hung process may wait 10 s for its end, and tells within a second.
     assert float(service["WatchdogSec"]) > max(policy.part_s, policy.silent_s) + 10.0 + 1.0
     assert service["TimeoutStartSec"] == "infinity"
+
+
+# --- The supervisor's signs of life: the part that is longest without a turn --------------------
+
+
+def test_the_oldest_turn_is_told() -> None:
+    now_ns = 100_000_000_000
+    last_ticks_ns = {
+        "render": now_ns - 5_000_000,
+        "link fc": now_ns - 7_100_000_000,
+        "feed": now_ns + 9,
+    }
+    assert line(last_ticks_ns, now_ns) == b"link-fc 7100\n"
+    assert line({}, now_ns) == b"all 0\n"
+
+
+def test_a_pulse_is_read_and_a_supervisor_that_does_not_read_is_not_waited_for() -> None:
+    reading, writing = os.pipe()
+    beating = threading.Event()
+
+    def last_ticks_ns() -> dict[str, int]:
+        beating.set()
+        return {}
+
+    while True:  # until the pipe is full
+        os.set_blocking(writing, False)
+        try:
+            os.write(writing, b"x" * 4096)
+        except BlockingIOError:
+            break
+    pulse = Pulse(last_ticks_ns, writing)
+    pulse.start()
+    assert beating.wait(20.0)
+    pulse.stop(clean_shutdown=True)
+    os.close(reading)
+
+
+@pytest.mark.parametrize("clean_shutdown", [True, False])
+def test_the_last_word_says_whether_the_end_is_in_order(clean_shutdown: bool) -> None:
+    reading, writing = os.pipe()
+    pulse = Pulse(lambda: {}, writing)
+    pulse.start()
+    pulse.stop(clean_shutdown=clean_shutdown)
+    last = os.read(reading, 4096).splitlines()[-1]
+    os.close(reading)
+    assert last == (f"{ENDING} 0" if clean_shutdown else "failing 0").encode()
+
+
+def test_a_frame_that_a_part_keeps_is_seen() -> None:
+    """The feed waits for the camera as long as it likes, and for no part."""
+    taken, go = threading.Event(), threading.Event()
+
+    class Source:
+        def frames(self):  # type: ignore[no-untyped-def]
+            yield object()
+
+        def close(self) -> None:
+            pass
+
+    def keeps(_: object) -> None:
+        taken.set()
+        go.wait(20.0)
+
+    feed = Feed(Source(), keeps)  # type: ignore[arg-type]
+    feed.start()
+    assert taken.wait(20.0)
+    assert feed.last_tick_ns == feed.last_tick_ns
+    go.set()
+    feed.stop()
+    assert feed.last_tick_ns < feed.last_tick_ns
+
+
+def test_what_is_no_beat_is_no_sign_of_life() -> None:
+    """The pipe is the process's own; a library that writes into it must not end the supervisor."""
+    script = (
+        "import os, sys; os.write(int(sys.argv[1][8:]), b'a 1\\nnonsense\\nb x\\nc 2500\\nd 1')"
+    )
+    process = FlightProcess([sys.executable, "-S", "-c", script], standby=False)
+    assert process.wait(20.0) == 0
+    assert process.beats() == (Beat("a", 0.001), Beat("c", 2.5))
+    assert process.beats() == ()
+    process.close()
+    process.close()
+
+
+def test_a_part_that_was_made_long_before_the_start_is_no_hang() -> None:
+    """A slow computer compiles for half a minute between: the process was ended at its first beat,
+    "hangs (health)", and would have been each time.
+    """
+    reading, writing = os.pipe()
+    made_ns = time.monotonic_ns() - 60_000_000_000
+    pulse = Pulse(lambda: {"health": made_ns, "feed": time.monotonic_ns()}, writing)
+    pulse.start()
+    first = os.read(reading, 100).split(b"\n")[0]
+    pulse.stop(clean_shutdown=True)
+    os.close(reading)
+    name, age_ms = first.split()
+    assert name == b"health"
+    assert int(age_ms) < 30_000  # since the start, whatever the machine does meanwhile
+
+
+# --- restart ------------------------------------------------------------------------------------
+
+
+MODEL = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
+CAMERA = {"model": MODEL, "source": "udp://x:1"}
+
+
+def deployment(stick: Path, **bridge: str) -> CompanionConfig:
+    data = {
+        "map": "map", "camera": CAMERA, "bridge": bridge,
+        "record": {"folder": str(stick / "flight")},
+    }  # fmt: skip
+    return parse_config(data, "here")
+
+
+def test_what_can_be_written_stays_as_it_is(tmp_path: Path) -> None:
+    config = deployment(tmp_path / "new", tlog=str(tmp_path / "logs" / "a.tlog"))
+    assert without_lost_disks(config) == (config, "")
+    assert not list((tmp_path / "new").iterdir())
+
+
+def test_a_stick_that_is_gone_costs_the_record_and_not_the_flight(tmp_path: Path) -> None:
+    """Its mount point is a folder of root's again, or is no more: no disk fault, and each restart
+    ended with a wrong setting.
+    """
+    stick = tmp_path / "stick"
+    stick.write_text("no folder any more")
+    left, told = without_lost_disks(deployment(stick, tlog=str(stick / "a.tlog")))
+    assert left.record is None
+    assert left.bridge.tlog is None
+    assert str(stick) in told
+    # They are only read and written where that goes, and keep their names.
+    assert left.state_folder == stick
+
+
+def test_one_disk_of_two(tmp_path: Path) -> None:
+    stick = tmp_path / "stick"
+    stick.write_text("")
+    left, told = without_lost_disks(deployment(tmp_path, tlog=str(stick / "a.tlog")))
+    assert left.record is not None
+    assert left.bridge.tlog is None
+    assert told == f"{stick}: Not a directory" or str(stick) in told
+
+
+def test_a_log_that_is_there_is_appended_to(tmp_path: Path) -> None:
+    (tmp_path / "a.tlog").touch()
+    config = deployment(tmp_path, tlog=str(tmp_path / "a.tlog"))
+    left, told = without_lost_disks(config, lambda _: "Permission denied")
+    assert left.bridge.tlog == tmp_path / "a.tlog"
+    assert left.record is None
+    assert told == f"{tmp_path}: Permission denied"
+
+
+def test_a_disk_that_stands_still_is_not_even_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.supervision.restart._PATIENCE_S", 0.05)
+    still = threading.Event()
+
+    def probe(folder: Path) -> str:
+        if folder == tmp_path / "stick":
+            still.wait(120.0)
+        return ""
+
+    config = deployment(tmp_path / "stick", tlog=str(tmp_path / "a.tlog"))
+    left, told = without_lost_disks(config, probe)
+    still.set()
+    assert told == f"{tmp_path / 'stick'}: does not answer"
+    assert left.record is None
+    assert left.bridge.tlog == tmp_path / "a.tlog"
+    assert left.state_folder is None
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [(errno.ENOSPC, False), (errno.EUCLEAN, False), (errno.EACCES, True)]
+)
+def test_a_full_or_failing_disk_is_the_recorders_to_tell(tmp_path, monkeypatch, number, told):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(number, "as it is")
+
+    monkeypatch.setattr("tempfile.mkstemp", full)
+    assert bool(write_problem(tmp_path)) is told

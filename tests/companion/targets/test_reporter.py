@@ -1,22 +1,31 @@
+import itertools
 import threading
 import time
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 
 from companion.config import TargetConfig
+from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import Detection
+from companion.targets.history import PoseHistory
+from companion.targets.numbers import TargetNumbers
+from companion.targets.pictures import RecentPictures
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
 from localizer.errors import MapCacheError
+from localizer.geometry.pose import Pose, so3_exp, so3_log
 from localizer.map.cache.pick import BundleHits
-from localizer.types import PoseEstimate
+from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.messages import TrackRequest
 from tests.companion.estimates import estimated
-
-MS = 1_000_000
+from tests.companion.targets.scene import MS, estimate, pose_at
 
 
 def _estimate(time_ns: int, accepted: bool = True) -> PoseEstimate:
@@ -160,3 +169,189 @@ def test_a_click_that_no_map_answers_is_refused_and_not_left_alive():
     assert gone == ["ground station 3"]
     assert said == [alert(AlertId.TARGET_UNREADABLE, number=3)]
     assert reporter.failed == 1
+
+
+# --- Where the camera was at a time that no frame has, and at one that a frame has nearly -------
+
+
+def estimate_at(time_ns):
+    """Of one pose, whenever."""
+    return estimate(pose_at(1.0), time_ns)
+
+
+def test_of_two_frames_that_are_near_the_nearer_one_is_meant():
+    """At 60 frames/s both neighbours are within 20 ms, and a gimbal turns 1 degree between them."""
+    history = PoseHistory()
+    for k in range(4):
+        history.add(estimate_at(round(k * 16.7 * MS)))
+    for k in range(4):
+        at = history.at(round(k * 16.7 * MS) - MS // 2)
+        assert at.exposure_time_ns == round(k * 16.7 * MS), k
+
+
+def test_between_two_frames_the_pose_is_between_and_the_worse_covariance_holds():
+    history = PoseHistory()
+    begin = estimate_at(0)
+    end = estimate_at(200 * MS)
+    place = Pose(
+        end.world_from_camera.rotation, end.world_from_camera.translation + np.array([4.0, 0, 0])
+    )
+    worse = replace(end, world_from_camera=place, covariance=np.eye(6) * 9.0)
+    history.add(begin)
+    history.add(worse)
+    at = history.at(50 * MS)
+    offset = at.world_from_camera.translation - begin.world_from_camera.translation
+    np.testing.assert_allclose(offset, [1.0, 0.0, 0.0], atol=1e-9)
+    added = at.covariance - worse.covariance
+    assert (np.diag(added) >= 0.0).all()
+    assert np.abs(added).max() < 1e-3  # 200 ms of a motion of which nothing says that it changes
+    assert history.at(400 * MS) is None
+    assert history.at(-100 * MS) is None
+
+
+def _swinging(time_s):
+    """Swings by 6 degrees and 3 m, once in 4 s."""
+    turn = np.array([0.0, 0.0, 0.1 * np.sin(0.5 * np.pi * time_s)])
+    base = pose_at(1.0)
+    aside = np.array([3.0 * np.cos(0.5 * np.pi * time_s), 0.0, 0.0])
+    return Pose(so3_exp(turn) @ base.rotation, base.translation + aside)
+
+
+def test_between_two_poses_of_a_camera_that_swings_the_error_is_in_the_covariance():
+    """At two poses a second a line between them misses the swing by a degree: metres on the ground.
+
+    Told was the covariance of the neighbours, 0.06 degrees.
+    """
+    history, sigma = PoseHistory(), np.repeat([0.1, 1e-3], 3)
+    times = range(1000, 9000, 500)
+    for ms in times:
+        told = estimate(_swinging(ms / 1e3), ms * MS)
+        history.add(replace(told, covariance=np.diag(sigma**2)))
+    errors = []
+    for ms in range(2000, 7000, 50):
+        at, true = history.at(ms * MS), _swinging(ms / 1e3)
+        pose = at.world_from_camera
+        off = np.concatenate(
+            [pose.translation - true.translation, so3_log(pose.rotation @ true.rotation.T)]
+        )
+        errors.append(np.abs(off) / np.sqrt(np.diag(at.covariance)))
+    assert np.max(errors) < 2.0
+
+
+def test_between_the_frames_of_a_steady_flight_the_covariance_is_what_it_was():
+    history, sigma = PoseHistory(), np.repeat([0.06, 4.4e-4], 3)
+    rng = np.random.default_rng(0)
+    for ms in range(1000, 6000, 100):
+        pose = pose_at(ms / 1e3)
+        off = rng.normal(0.0, sigma)
+        told = Pose(so3_exp(off[3:]) @ pose.rotation, pose.translation + off[:3])
+        history.add(replace(estimate(told, ms * MS), covariance=np.diag(sigma**2)))
+    middles = [history.at(ms * MS) for ms in range(1550, 5500, 100)]
+    grown = [np.sqrt(np.diag(at.covariance)) / sigma for at in middles if at is not None]
+    assert len(grown) == len(middles)
+    assert np.median(grown) < 1.25
+
+
+# --- The numbers that targets have in MAVLink ---------------------------------------------------
+
+
+def test_a_name_keeps_its_number_and_a_click_its_own():
+    numbers = TargetNumbers()
+    first, second = numbers.number_of("car a"), numbers.number_of("car b")
+    assert first != second
+    assert numbers.number_of("car a") == first
+    assert numbers.number_of("ground station 7") == 7
+    assert numbers.number_of("console 8") == 8
+
+
+def test_names_without_end_take_no_memory_without_end():
+    """A detector names what it sees anew as long as it flies; no number is given twice."""
+    numbers = TargetNumbers()
+    kept = numbers.number_of("kept")
+    given = set()
+    for k in range(2000):
+        given.add(numbers.number_of(f"thing {k}"))
+        assert numbers.number_of("kept") == kept  # what is still there is not forgotten
+    assert len(given) == 2000
+    assert kept not in given
+    assert numbers.number_of("thing 0") not in given  # it was forgotten
+
+
+# --- pictures -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("shape", "kept"), [((54, 96), 16), ((540, 960), 16), ((2160, 3840), 4)])
+def test_pictures_are_kept_by_number_and_by_bytes(shape, kept):
+    """Attack: sixteen of 4K took 400 MB."""
+    pictures = RecentPictures[np.ndarray](16, lambda image: image.nbytes)
+    blank = np.zeros((*shape, 3), np.uint8)
+    for _ in range(40):
+        pictures.append(blank)
+    assert len(pictures) == kept
+    assert pictures.nbytes == kept * blank.nbytes <= 100 << 20
+
+
+def test_what_is_dropped_makes_room():
+    pictures = RecentPictures[bytes](8, len, most_bytes=40)
+    for k in range(5):
+        pictures.append(bytes([k]) * 10)
+    assert [item[0] for item in pictures] == [1, 2, 3, 4]
+    pictures.retain(lambda item: item[0] >= 3)
+    assert (len(pictures), pictures.nbytes) == (2, 20)
+    pictures.append(b"\x09" * 100)  # alone above what is allowed: the newest three stay
+    assert [item[0] for item in pictures] == [3, 4, 9]
+
+
+# --- Clicks through the targets' thread; what they mean is in test_operator.py ------------------
+
+
+class Ground:
+    """A ground station that clicks into frames of a camera 100 m above flat ground."""
+
+    def __init__(self):
+        self.targets: list[Any] = []
+        self.alerts: list[Any] = []
+        self.gone: list[Any] = []
+        config = TargetConfig(operator_delay_ms=0.0)
+        self.numbers = itertools.count(1)
+        self.reporter = TargetReporter(config, flat, self.targets.append, on_gone=self.gone.append)
+        self.clicks = ClickPolicy(self.reporter, self.alerts.append, config)
+        self.reporter.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.reporter.stop()
+
+    def sees(self, time_ns, state=TrackingState.TRACKING):
+        estimate = estimated(time_ns=time_ns, state=state)
+        self.clicks.add_estimate(estimate)
+        self.reporter.add_estimate(estimate)
+
+    def clicks_at(self, x, y, time_ns):
+        self.clicks.on_request(TrackRequest("point", time_ns, (x, y), number=next(self.numbers)))
+
+    def has(self, count):
+        """Whether so many targets were told (each once: no other frame came since)."""
+        return sleep_until(lambda: len({t.fix.target_id for t in self.targets}) >= count, 30.0)
+
+
+def flat(origin, directions):
+    return BundleHits(-origin[2] / directions[:, 2], np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
+
+
+def test_a_second_click_is_a_second_target():
+    """A, then B 60 m away: B was reported as A, twice, and then with A's way to B as velocity."""
+    with Ground() as ground:
+        for k, x in enumerate((0.25, 0.25 + 0.52, 0.25, 0.25 + 0.52)):
+            ground.sees(k * 400 * MS)
+            ground.clicks_at(x, 0.5, k * 400 * MS + 10)
+            assert ground.has(k + 1)
+        places = {
+            t.fix.target_id: tuple(np.round(t.fix.position_world[:2])) for t in ground.targets
+        }
+        a, b = list(places.values())[:2]
+        assert b[0] - a[0] == pytest.approx(60.0, abs=1.0)
+        assert list(places.values()) == [a, b, a, b]
+        assert all(t.velocity is None for t in ground.targets)

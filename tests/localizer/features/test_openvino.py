@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -13,8 +15,9 @@ import numpy as np
 import pytest
 
 from localizer.features import providers
-from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor
+from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor, load_extractor
 from localizer.features.openvino_session import OpenVinoSession, is_worthwhile
+from localizer.features.subgraph import cut_to_outputs
 
 FLAGS = "processor\t: 0\nflags\t\t: fpu avx512f amx_bf16 amx_tile\n"
 
@@ -107,3 +110,58 @@ def test_it_tells_its_maker_nothing():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, text=True)
     assert done.returncode == 0, done.stderr
+
+
+# --- A network cut to some of its outputs computes the same there, and nothing for the others ---
+
+
+COARSE = ["features_0", "confidence_0", "features_1", "confidence_1"]
+
+
+def picture(side: int = 128) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (side, side, 3), dtype=np.uint8)
+
+
+def cpu_seconds(extractor, rgb) -> float:
+    took = []
+    for _ in range(5):
+        began = time.process_time()
+        extractor.extract(rgb)
+        took.append(time.process_time() - began)
+    return min(took)
+
+
+def test_the_levels_that_stay_are_the_same_bit_by_bit_and_cost_half():
+    whole, coarse = load_extractor(threads=1), load_extractor(threads=1, finest=4)
+    rgb = picture()
+    kept = coarse.extract(rgb).levels
+    assert [level.stride for level in kept] == [8, 4]
+    for level, same in zip(kept, whole.extract(rgb).levels[:2], strict=True):
+        np.testing.assert_array_equal(level.features, same.features)
+        np.testing.assert_array_equal(level.confidence, same.confidence)
+    assert cpu_seconds(coarse, rgb) < 0.6 * cpu_seconds(whole, rgb)
+
+
+def test_a_cut_model_is_valid_and_one_with_all_outputs_is_untouched():
+    onnx = pytest.importorskip("onnx")
+    model = SHIPPED_MODEL.read_bytes()
+    cut = onnx.load_from_string(cut_to_outputs(model, COARSE))
+    onnx.checker.check_model(cut)
+    assert [output.name for output in cut.graph.output] == COARSE
+    whole = onnx.load_from_string(model)
+    names = [output.name for output in whole.graph.output]
+    assert cut_to_outputs(model, names) == model
+    needed = {name for node in cut.graph.node for name in node.input} | set(COARSE)
+    assert all(needed.intersection(node.output) for node in cut.graph.node)
+    assert len(cut.graph.node) < len(whole.graph.node)
+
+
+# --- Importing the localizer must not start onnxruntime's telemetry -----------------------------
+
+
+def test_no_device_id_is_written(tmp_path):
+    """onnxruntime with telemetry leaves a device id and a queue in the cache folder."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("ORT_", "XDG_"))}
+    environment["HOME"] = str(tmp_path)
+    subprocess.run([sys.executable, "-c", "import localizer.features"], env=environment, check=True)
+    assert not list(tmp_path.rglob("*onnxruntime*"))

@@ -13,6 +13,12 @@ from hypothesis import strategies as st
 
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
+from localizer.integrity.confirmation import (
+    Consistency,
+    IndependentEvidence,
+    TentativeTrack,
+    consistency_test,
+)
 from localizer.integrity.probability import log_odds
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
@@ -108,3 +114,33 @@ def test_evidence_that_is_no_number_accepts_nothing(name):
     assert is_acceptable(CONFIG, _with(good), 1.0)
     assert not is_acceptable(CONFIG, _with(good | {name: math.nan}), 1.0)
     assert not is_acceptable(CONFIG, _with(good), math.nan)
+
+
+# --- What confirms a place that was found by searching: a way that was flown, and no noise ------
+
+
+BEGUN = Pose(np.eye(3), np.array([0.0, 0.0, 100.0]))
+
+
+def weighed(east_m: float, sigmas_m: tuple[float, float]) -> Consistency:
+    """0.2 s after the first acceptance, of estimates with these sigmas, east and north."""
+    covariance = np.diag([sigmas_m[0] ** 2, sigmas_m[1] ** 2, 0.01, 1e-4, 1e-4, 1e-4])
+    pose = Pose(np.eye(3), np.array([east_m, 0.0, 100.0]))
+    tentative_track = TentativeTrack(BEGUN, covariance, 0)
+    return consistency_test(
+        tentative_track, pose, covariance, 200_000_000, IndependentEvidence(), CONFIG
+    )
+
+
+@pytest.mark.parametrize("east_m", [5.5, -9.0])
+def test_estimates_that_slide_along_what_looks_alike_have_flown_no_way(east_m: float) -> None:
+    """A row of crops, a street: each fits 3 m beside the one before, and says so. Two of them 5 m
+    apart, the same view, were taken for a way over which the map goes on to match.
+    """
+    assert weighed(east_m, (3.0, 0.1)) is Consistency.PENDING
+
+
+def test_a_way_that_is_known_confirms_however_unsure_the_other_axis_is() -> None:
+    assert weighed(6.0, (0.1, 3.0)) is Consistency.CONFIRMED
+    assert weighed(6.0, (0.15, 0.15)) is Consistency.CONFIRMED
+    assert weighed(18.0, (3.0, 0.1)) is Consistency.CONFIRMED  # farther than they slide

@@ -11,6 +11,8 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import from_origin
 
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.building.build import build_cache
@@ -19,6 +21,7 @@ from localizer.map.cache.cache import TileCache
 
 ORIGIN = Geodetic(47.2, 8.2, 430.0)
 SIZE_M = 400.0
+PLACE = (500_100.0, 5_228_300.0)  # of rasters: left and top in UTM zone 32
 SEPARATION_M = 47.5
 
 
@@ -62,11 +65,21 @@ def glb(positions, uvs, faces, image: bytes, mime: str = "image/jpeg", **extra) 
         "scenes": [{"nodes": [0]}],
         "scene": 0,
     } | extra
+    return pack_glb(document, binary)
+
+
+def pack_glb(document: dict, binary: bytes) -> bytes:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
     body = struct.pack("<I4s", len(text), b"JSON") + text
     body += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def unpack_glb(content: bytes) -> tuple[dict, bytes]:
+    length = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + length]), content[28 + length :]
 
 
 def b3dm(content: bytes, rtc: list[float] | None = None) -> bytes:
@@ -127,15 +140,44 @@ def write_tileset(folder: Path, *, levels: int = 3, refine: str = "REPLACE") -> 
         }
 
     root = node(0, -SIZE_M / 2, -SIZE_M / 2, SIZE_M)
-    root["transform"] = LocalFrame(ORIGIN).ecef_from_enu.matrix.T.ravel().tolist()
-    root["refine"] = refine
-    document = {
-        "asset": {"version": "1.1", "extras": {"geoid_separation_m": SEPARATION_M}},
-        "geometricError": 100.0,
-        "root": root,
+    asset = {"version": "1.1", "extras": {"geoid_separation_m": SEPARATION_M}}
+    return write_tree(folder, root | {"refine": refine}, asset=asset)
+
+
+def write_tree(folder: Path, root: dict, name: str = "tileset.json", *, asset=None) -> Path:
+    """A tileset's JSON; `root` is placed about the origin and 100 m wide unless it says otherwise.
+
+    What is None in `root` is left out.
+    """
+    known = {
+        "transform": LocalFrame(ORIGIN).ecef_from_enu.matrix.T.ravel().tolist(),
+        "boundingVolume": {"sphere": [0, 0, 0, 100]},
+        "geometricError": 0,
     }
-    path = folder / "tileset.json"
-    path.write_text(json.dumps(document))
+    node = {key: value for key, value in (known | root).items() if value is not None}
+    document = {"asset": asset or {"version": "1.0"}, "geometricError": 500, "root": node}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(json.dumps(document))
+    return folder / name
+
+
+def write_raster(path: Path, data, crs="EPSG:32632", step=1.0, place=PLACE, **options) -> Path:
+    """A GeoTIFF of bands or of one. options: of its profile, tags, and what rasterio sets after."""
+    data = data if data.ndim == 3 else data[None]
+    tags = options.pop("tags", {})
+    kinds = ("units", "scales", "offsets", "colorinterp")
+    told = {kind: options.pop(kind) for kind in kinds if kind in options}
+    profile = {
+        "driver": "GTiff", "width": data.shape[2], "height": data.shape[1], "count": data.shape[0],
+        "dtype": data.dtype, "crs": crs,
+        "transform": from_origin(*place, *np.broadcast_to(step, 2)),
+    } | options  # fmt: skip
+    with rasterio.open(path, "w", **profile) as out:
+        for name, value in told.items():
+            setattr(out, name, value)
+        out.write(data)
+        if tags:
+            out.update_tags(**tags)
     return path
 
 

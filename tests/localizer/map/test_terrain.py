@@ -6,26 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.transform import from_origin
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.terrain import open_terrain
+from tests.localizer.map.conftest import write_raster
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
 STEP = 1 / 3600  # degrees, as Copernicus' 30 m
 
 
 def written(path: Path, heights: np.ndarray, west: float = 7.99, crs: str | None = "EPSG:4326"):
-    profile = {
-        "driver": "GTiff", "width": heights.shape[1], "height": heights.shape[0], "count": 1,
-        "dtype": "float32", "crs": crs, "nodata": -9999.0,
-        "transform": from_origin(west, 47.01, STEP, STEP),
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as out:
-        out.write(heights.astype(np.float32)[None])
-    return path
+    return other(path, heights.astype(np.float32), crs=crs, place=(west, 47.01), nodata=-9999.0)
+
+
+def other(path: Path, data: np.ndarray, **options):
+    about = {"crs": "EPSG:4326", "step": STEP, "place": (7.99, 47.01)}
+    return write_raster(path, data, **about | options)
 
 
 def test_heights_lie_where_the_raster_has_them(tmp_path):
@@ -67,20 +64,6 @@ def test_no_raster_is_named(tmp_path):
 HILL = np.linspace(600.0, 640.0, 72 * 72).reshape(72, 72)
 
 
-def other(path: Path, data: np.ndarray, step=(STEP, STEP), **tags):
-    bands = data if data.ndim == 3 else data[None]
-    profile = {
-        "driver": "GTiff", "width": bands.shape[2], "height": bands.shape[1],
-        "count": bands.shape[0], "dtype": bands.dtype, "crs": "EPSG:4326",
-        "transform": from_origin(7.99, 47.01, *step),
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as out:
-        out.write(bands)
-        for name, value in tags.items():
-            setattr(out, name, (value,))
-    return path
-
-
 @pytest.mark.parametrize(
     ("data", "why"),
     [
@@ -98,7 +81,7 @@ def test_what_holds_no_heights_is_no_ground(tmp_path, data, why):
 
 
 @pytest.mark.parametrize(
-    ("data", "tags"), [(HILL * 100.0, {"scales": 0.01}), (HILL / 0.3048, {"units": "ft"})]
+    ("data", "tags"), [(HILL * 100.0, {"scales": [0.01]}), (HILL / 0.3048, {"units": ["ft"]})]
 )
 def test_scale_and_unit_are_honoured(tmp_path, data, tags):
     found = open_terrain(other(tmp_path / "t.tif", data, **tags), FRAME).heights

@@ -3,17 +3,28 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
-from localizer.errors import OdometryError
-from localizer.geometry.pose import Pose, so3_exp
+from localizer.device_array import DeviceArray
+from localizer.errors import DeviceArrayError, OdometryError
+from localizer.geometry.pose import Array, Pose, hat, so3_exp, so3_log
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryStatus
-from localizer.odometry.ground import FlatGround, GroundUncertainty, RangefinderGround, TerrainModel
-from localizer.odometry.keyframe import DepthSource
+from localizer.odometry.ground import (
+    FlatGround,
+    GroundUncertainty,
+    RangefinderGround,
+    TerrainModel,
+    ground_points,
+    height_above_ground,
+)
+from localizer.odometry.keyframe import DepthSource, keyframe_anchors
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
-from localizer.odometry.usability import ImageFault, Usability
+from localizer.odometry.parallax import ParallaxAlignment, ParallaxView, align
+from localizer.odometry.usability import ImageFault, Usability, examine
+from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
     PoseConstraint,
@@ -21,8 +32,9 @@ from localizer.registration.priors import (
     combine,
     height_constraint,
 )
+from localizer.registration.sampling import sample_features
 from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
-from tests.localizer.registration.conftest import SyntheticPlace
+from tests.localizer.registration.conftest import SyntheticPlace, camera_pose
 
 COVERED = Usability(ImageFault.FLAT, 0.0, 0.0, 0.0, 0.0)
 
@@ -228,7 +240,6 @@ def test_few_readings_are_no_ground():
     assert sounded.at(4 * STEP_NS) is None
     sounded.add(4 * STEP_NS, 13.0)
     found = sounded.at(4 * STEP_NS)
-    assert found is not None
     assert found.height_m == 5.0
     assert sounded.at(40 * STEP_NS) is None  # of long ago
 
@@ -347,3 +358,244 @@ def test_sensors_corrected_by_the_start_do_not_make_the_start_more_certain(plain
             assert (sigma[:3] > 0.95 * np.sqrt(unsure.diagonal()[:3])).all()
         else:  # never compared with the start, the sensors are evidence of their own
             assert (sigma[:3] < 0.7 * np.sqrt(unsure.diagonal()[:3])).all()
+
+
+# --- Where a keyframe's anchors come from -------------------------------------------------------
+
+
+POSE = camera_pose(np.array([5.0, -3.0, 80.0]), 60.0, 30.0)
+
+
+class Slope:
+    """Rises 0.1 m per metre to the east."""
+
+    def height(self, east, north):
+        return 0.1 * east
+
+
+def test_map_points_keep_their_places_and_get_the_pictures_features(hills):
+    features, surface = hills.frame(3).features, hills.surface(3)
+    anchors, source = keyframe_anchors(features, CAMERA, hills.pose(3), surface, None, 5000)
+    assert source is DepthSource.MAP
+    assert len(anchors.points_world) > 0.8 * len(surface)
+    assert {tuple(p) for p in anchors.points_world} <= {tuple(p) for p in surface}
+    pixels, inside = CAMERA.project(hills.pose(3).inverse.apply(anchors.points_world))
+    assert inside.all()
+    np.testing.assert_allclose(pixels, anchors.pixels, atol=1e-4)
+    level = features.levels[-1]
+    uv = anchors.pixels.astype(np.float64) / level.stride - 0.5
+    np.testing.assert_allclose(
+        anchors.features[-1], sample_features(level.features, uv[:, 0], uv[:, 1]), atol=1e-5
+    )
+
+
+def test_the_ground_fills_what_the_map_leaves(hills):
+    """The map ends in the middle of the picture: each half gets its own depth."""
+    surface, pose = hills.surface(3), hills.pose(3)
+    pixels, _ = CAMERA.project(pose.inverse.apply(surface))
+    left = surface[pixels[:, 0] < CAMERA.width / 2]
+    ground = FlatGround(-50.0)  # far below the map's surfaces, to tell them apart
+    anchors, source = keyframe_anchors(hills.frame(3).features, CAMERA, pose, left, ground, 600)
+    by_map = anchors.points_world[:, 2] > -20
+    assert (anchors.pixels[by_map, 0] < CAMERA.width / 2 + 2).all()
+    right = anchors.pixels[:, 0] > CAMERA.width / 2 + 12
+    assert right.sum() > 150
+    assert not by_map[right].any()
+    assert source is DepthSource.MAP
+    few, source = keyframe_anchors(hills.frame(3).features, CAMERA, pose, left[::10], ground, 600)
+    assert source is DepthSource.GROUND
+    assert len(few.points_world) > 300
+
+
+@pytest.mark.parametrize("ground", [FlatGround(4.0), Slope()])
+def test_rays_meet_the_ground_where_it_is(ground):
+    pixels = np.array([[10.0, 20.0], [80.0, 60.0], [150.0, 110.0]])
+    points, met = ground_points(ground, POSE, CAMERA, pixels)
+    assert met.all()
+    np.testing.assert_allclose(points[:, 2], ground.height(*points.T[:2]), atol=0.01)
+    np.testing.assert_allclose(CAMERA.project(POSE.inverse.apply(points))[0], pixels, atol=1e-6)
+
+
+def test_features_on_the_gpu_are_refused(hills):
+    level = hills.frame(0).features.levels[0]
+    on_device = replace(level, features=DeviceArray(64, level.features.shape, np.dtype("f4")))
+    features = replace(hills.frame(0).features, levels=(on_device,))
+    with pytest.raises(DeviceArrayError, match="extracted to the host"):
+        keyframe_anchors(features, CAMERA, POSE, None, FlatGround(0.0), 500)
+
+
+def test_the_ground_is_below_the_roofs():
+    rng = np.random.default_rng(0)
+    heights = np.r_[rng.normal(12.0, 0.3, 600), rng.uniform(16.0, 30.0, 400)]
+    points = np.column_stack([rng.uniform(0, 100, (1000, 2)), heights])
+    assert FlatGround.under(points).height_m == pytest.approx(12.0, abs=0.4)
+
+
+def test_an_uncertain_place_above_a_slope_is_at_an_uncertain_height_above_the_ground():
+    """10 m of sigma across 20 % of slope are 2 m of height; along the slope's contours none."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-50, 50, (500, 2)), np.zeros(500)])
+    points[:, 2] = 0.2 * points[:, 0] + rng.normal(0, 0.5, 500)
+    place = np.array([0.0, 0.0, 80.0])
+    for variance, expected in (((100.0, 0.0, 1.0), 5**0.5), ((0.0, 100.0, 1.0), 1.0)):
+        above, sigma = height_above_ground(points, np.diag(variance), place)
+        assert above == pytest.approx(80.0, abs=1.0)
+        assert sigma == pytest.approx(expected, rel=0.05)
+
+
+# --- Which pictures are refused, and that poor but usable ones are not --------------------------
+
+
+SIZE = (240, 320, 3)
+
+
+def ground_picture(seed: int = 0) -> np.ndarray:
+    """Texture on all scales, as the ground has it, with a camera's noise."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(SIZE[:2], np.float32)
+    for cells in (4, 10, 25, 60, 120):
+        field = rng.standard_normal((cells * 3 // 4, cells)).astype(np.float32)
+        total += cv2.resize(field, (SIZE[1], SIZE[0]), interpolation=cv2.INTER_CUBIC)
+    grey = 110 + 18 * total
+    noisy = grey[..., None] + rng.normal(0, 2, SIZE)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def in_fog(image: np.ndarray, visible: float) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    hazy = image * visible + 205 * (1 - visible) + rng.normal(0, 1.5, image.shape)
+    return np.clip(hazy, 0, 255).astype(np.uint8)
+
+
+def covered(grey: float) -> np.ndarray:
+    """A hand over the lens: a smooth gradient with noise."""
+    rng = np.random.default_rng(2)
+    ramp = grey + 0.1 * np.arange(SIZE[1])[None, :, None]
+    return np.clip(ramp + rng.normal(0, 3, SIZE), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("picture", "fault"),
+    [
+        (covered(3.0) // 12, ImageFault.BLACK),
+        (covered(40.0), ImageFault.FLAT),
+        (in_fog(ground_picture(), 0.01), ImageFault.FLAT),
+        (np.full(SIZE, 255, np.uint8), ImageFault.SATURATED),
+        (cv2.GaussianBlur(ground_picture(), (0, 0), 6), ImageFault.BLURRED),
+        (cv2.blur(ground_picture(), (41, 1)), ImageFault.BLURRED),
+        (cv2.blur(ground_picture(), (1, 41)), ImageFault.BLURRED),
+    ],
+)
+def test_a_picture_without_use_is_refused_by_its_name(picture, fault):
+    verdict = examine(picture)
+    assert verdict.fault is fault
+    assert not verdict.usable
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        ground_picture(),
+        in_fog(ground_picture(), 0.25),
+        cv2.GaussianBlur(ground_picture(), (0, 0), 1.0),
+        cv2.blur(ground_picture(), (5, 1)),
+        (ground_picture() * 0.15).astype(np.uint8),
+        np.minimum(ground_picture().astype(int) + 90, 255).astype(np.uint8),
+    ],
+    ids=["clear", "fog", "defocus", "motion", "dusk", "bright"],
+)
+def test_a_poor_picture_is_not_refused(picture):
+    assert examine(picture).fault is None
+
+
+def test_a_repeated_picture_is_a_frozen_stream():
+    picture = ground_picture()
+    assert examine(picture, picture.copy()).fault is ImageFault.FROZEN
+    assert examine(picture, ground_picture(1)).fault is None
+
+
+def test_half_a_picture_is_enough():
+    picture = ground_picture()
+    picture[:120] = 128
+    verdict = examine(picture)
+    assert verdict.usable
+    assert verdict.structured == pytest.approx(0.5, abs=0.05)
+
+
+# --- The keyframe's pose from how the picture moved over the map's shape ------------------------
+
+
+FIRST, SECOND = 0, 6  # 24 m apart
+NOISE = 0.02
+
+
+@pytest.fixture(scope="module")
+def mountains() -> Flight:
+    return Flight(SyntheticPlace.from_seed(7, relief_m=25.0))
+
+
+def prior(flight: Flight, tilt_deg: float, shift_m: float) -> tuple[Array, Array]:
+    """Covariance (6, 6) and its root of a pose that keeps the ground in the picture's middle."""
+    pose = flight.pose(FIRST)
+    arm = pose.rotation[:, 2] * 100.0 / -pose.rotation[2, 2]
+    root = np.zeros((6, 6))
+    root[:3, :3] = shift_m * np.eye(3)
+    root[3:, 3:] = np.radians(tilt_deg) * np.eye(3)
+    root[:3, 3:] = hat(arm) @ root[3:, 3:]
+    return root @ root.T, root
+
+
+def aligned(flight: Flight, step: Array, covariance: Array) -> ParallaxAlignment | None:
+    first, second = flight.pose(FIRST), flight.pose(SECOND)
+    turn = so3_exp(step[3:])
+    moved = Pose(turn @ first.rotation, first.translation + step[:3])
+    arm = turn @ (second.translation - first.translation)
+    after = Pose(turn @ second.rotation, moved.translation + arm)
+    views = (
+        ParallaxView(flight.frame(FIRST).features, moved, CAMERA),
+        ParallaxView(flight.frame(SECOND).features, after, CAMERA),
+    )
+    return align(NumbaBackend(1), *views, flight.surface(FIRST), covariance, NOISE)
+
+
+def off(pose: Pose, truth: Pose) -> Array:
+    turn = np.degrees(so3_log(pose.rotation @ truth.rotation.T))
+    return np.concatenate([pose.translation - truth.translation, turn])
+
+
+def test_a_keyframe_that_is_off_is_brought_to_the_maps_shape(mountains: Flight) -> None:
+    covariance, root = prior(mountains, 1.0, 0.5)
+    before, after, distances, narrower = [], [], [], []
+    for seed in range(4):
+        step = root @ np.random.default_rng(seed).normal(0, 1, 6)
+        found = aligned(mountains, step, covariance)
+        error = off(found.first, mountains.pose(FIRST))
+        before.append(np.degrees(step[3:5]))
+        after.append(error[3:5].copy())
+        error[3:] = np.radians(error[3:])
+        distances.append(error @ np.linalg.solve(found.covariance, error) / 6)
+        narrower.append(np.linalg.det(found.covariance) / np.linalg.det(covariance))
+        # The second picture's pose goes along.
+        second = off(found.second, mountains.pose(SECOND))
+        np.testing.assert_allclose(second[3:5], after[-1], atol=0.5)
+    assert np.linalg.norm(after) < 0.85 * np.linalg.norm(before)  # small pictures, no detail
+    assert np.mean(distances) < 3.0
+    # Over the draws: this prior's axes are equally long, so which of them the cost is sampled along
+    # is the linear algebra library's choice, and one draw's figure differs between processors.
+    assert np.exp(np.mean(np.log(narrower))) < 0.1
+    assert max(narrower) < 0.5
+
+
+def test_a_keyframe_that_is_right_stays_there(mountains: Flight) -> None:
+    covariance, _ = prior(mountains, 0.2, 0.1)
+    found = aligned(mountains, np.zeros(6), covariance)
+    error = off(found.first, mountains.pose(FIRST))
+    error[3:] = np.radians(error[3:])
+    assert error @ np.linalg.solve(covariance, error) < 4.0
+
+
+def test_nothing_is_told_where_nothing_is_seen(mountains: Flight) -> None:
+    covariance, _ = prior(mountains, 0.2, 0.1)
+    elsewhere = mountains.surface(FIRST) + np.array([5000.0, 0.0, 0.0])
+    view = ParallaxView(mountains.frame(FIRST).features, mountains.pose(FIRST), CAMERA)
+    assert align(NumbaBackend(1), view, view, elsewhere, covariance, NOISE) is None

@@ -79,7 +79,6 @@ def query(small_assets, truth):
 
 def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
     found = opened.relocalizer.find(query)
-    assert found is not None
     metres, degrees = found.world_from_camera.distance_to(truth)
     assert (metres < 1.0, degrees < 0.5) == (True, True)
     assert found.exposure_time_ns == 123
@@ -142,7 +141,6 @@ def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, mo
         ]
         registered.clear()
         answer = found.confirm(query, [*alike[:20], best, *alike[20:]])
-    assert answer is not None
     assert answer.world_from_camera.distance_to(truth)[0] < 1.0
     assert len(registered) <= 12
 
@@ -168,7 +166,6 @@ def test_a_doubt_that_the_last_pass_leaves_is_settled(opened, query, truth, monk
 
     monkeypatch.setattr(JNGO, "register", doubtful_later)
     answer = opened.relocalizer.confirm(query, [best, *alike])
-    assert answer is not None
     assert answer.world_from_camera.distance_to(truth)[0] < 1.0
 
 

@@ -10,6 +10,12 @@ from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.synth.appearance.model import (
+    CONDITIONS,
+    Appearance,
+    apply_appearance,
+    sample_appearance,
+)
 from localizer.synth.tiles.props import car_mesh
 
 NADIR = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # x east, y south, z down
@@ -62,3 +68,42 @@ def test_a_car_drives_on_the_street(small_world, renderer):
     pixels = nearer > 0.2
     assert 150 < pixels.sum() < 700  # 4.5 x 1.84 m at 0.14 m per pixel
     assert 0.8 < nearer[pixels].max() < 3.0
+
+
+# --- appearance ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def view() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(40, 200, (96, 128, 3), dtype=np.uint8)
+    depth = np.tile(np.linspace(400, 60, 96, dtype=np.float32)[:, None], (1, 128))
+    depth[:8] = 0.0
+    return rgb, depth
+
+
+def test_the_default_appearance_changes_nothing(view: tuple[np.ndarray, np.ndarray]) -> None:
+    rgb, depth = view
+    np.testing.assert_array_equal(
+        apply_appearance(rgb, depth, Appearance(), np.random.default_rng(0)), rgb
+    )
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_every_condition_is_deterministic_and_visible(condition, view):
+    rgb, depth = view
+
+    def draw() -> np.ndarray:
+        rng = np.random.default_rng(5)
+        return apply_appearance(rgb, depth, sample_appearance(rng, condition), rng)
+
+    image = draw()
+    assert image.shape == rgb.shape
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image, draw())
+    assert np.abs(image.astype(int) - rgb).mean() > 3
+
+
+def test_an_unknown_condition_is_refused() -> None:
+    with pytest.raises(ValueError, match="sandstorm"):
+        sample_appearance(np.random.default_rng(0), "sandstorm")

@@ -16,9 +16,18 @@ import numpy as np
 import pytest
 
 from localizer.errors import MapSourceError
+from localizer.geometry.camera import Camera
 from localizer.geometry.geo import ecef_from_geodetic
+from localizer.geometry.pose import Pose
 from localizer.synth import world
 from localizer.synth.config import WorldConfig
+from localizer.synth.heightfield.render import render
+from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene
+from localizer.synth.plan.layout import plan_world
+from localizer.synth.plan.plan import WorldPlan
+from localizer.synth.visits.changes import Changes, apply_changes
+from localizer.synth.visits.survey import SurveyErrors
+from localizer.synth.visits.visit import survey_and_flight_visits
 from localizer.synth.world import WorldInfo, build_world
 
 TERRAIN_FACES = 2 * 20 * 20  # of a leaf, first in its face list
@@ -241,3 +250,118 @@ def test_live_is_the_same_place_in_another_light(small_world):
 def test_a_size_that_tiles_cannot_cover_is_refused(size):
     with pytest.raises(MapSourceError, match="multiple of 400"):
         WorldConfig(1, size)
+
+
+# --- heightfield --------------------------------------------------------------------------------
+
+
+N, CELL = 128, 0.5
+NADIR = np.diag([1.0, -1.0, -1.0])
+NOON = SkyLight((0.0, 0.0, 1.0), 0.7, 0.3)
+
+
+def land(height: np.ndarray | None = None) -> Land:
+    z = np.zeros((N, N), np.float32) if height is None else height.astype(np.float32)
+    return Land(z, np.full((N, N, 3), 0.5, np.float32), CELL)
+
+
+def lit(prisms: list[Prism], light: SkyLight = NOON) -> LitScene:
+    return light_scene(compose(land(), prisms), light, (0.5, 0.6, 0.7))
+
+
+def house(height: float = 10.0, ridge: float = 0.0) -> Prism:
+    corners = np.array([[40, 40], [80, 40], [80, 70], [40, 70]], np.float32)
+    return Prism(corners, height, ridge, (0.8, 0.1, 0.1), (0.2, 0.2, 0.8), 3.0)
+
+
+def test_depth_over_flat_ground_is_the_height() -> None:
+    camera = Camera.from_fov(64, 48, 60)
+    depth = render(lit([]), Pose(NADIR, np.array([32.0, 32.0, 50.0])), camera)[1]
+    np.testing.assert_allclose(depth, 50.0, atol=0.02)
+
+
+def test_depth_of_an_oblique_view_is_on_the_plane() -> None:
+    camera = Camera.from_fov(64, 48, 50)
+    c, s = np.cos(np.radians(40)), np.sin(np.radians(40))
+    rotation = np.array([[1, 0, 0], [0, -s, c], [0, -c, -s]])
+    pose = Pose(rotation, np.array([30.0, 5.0, 40.0]))
+    depth = render(lit([]), pose, camera)[1]
+    v, u = np.mgrid[0:48, 0:64] + 0.5
+    points = pose.apply(camera.rays(np.stack([u, v], -1)) * depth[..., None])
+    np.testing.assert_allclose(points[..., 2], 0.0, atol=0.02)
+
+
+def test_a_building_stands_up_and_has_its_colours() -> None:
+    camera = Camera.from_fov(96, 96, 40)
+    image, depth = render(lit([house()]), Pose(NADIR, np.array([30.0, 27.5, 70.0])), camera)
+    assert depth[48, 48] == pytest.approx(60.0, abs=0.05)
+    assert image[48, 48, 0] > 2 * image[48, 48, 2]
+    c, s = np.cos(np.radians(25)), np.sin(np.radians(25))
+    oblique = Pose(np.array([[1, 0, 0], [0, -s, c], [0, -c, -s]]), np.array([30.0, -15.0, 20.0]))
+    wall = render(lit([house()]), oblique, camera)[0].reshape(-1, 3).astype(int)
+    assert (wall[:, 2] > 2 * wall[:, 0]).sum() > 200
+
+
+def test_shadows_fall_away_from_the_sun() -> None:
+    sun = SkyLight((np.cos(np.radians(30)), 0.0, np.sin(np.radians(30))), 1.0, 0.3)
+    camera = Camera.from_fov(128, 128, 60)
+    # Columns grow with x: the sun stands in the east, so the shadow is west of the house.
+    pose = Pose(NADIR, np.array([30.0, 27.5, 60.0]))
+    image = render(lit([house()], sun), pose, camera)[0].astype(int).sum(-1)
+    middle = 64
+    west, east = image[middle, 20:30].mean(), image[middle, 100:108].mean()
+    assert west < 0.7 * east
+
+
+# --- Two visits to one place: what changed between them, and what a survey makes of it ----------
+
+
+@pytest.fixture(scope="module")
+def plan() -> WorldPlan:
+    return plan_world(WorldConfig(5, 400.0))
+
+
+def test_what_is_built_later_stands_on_free_ground(plan: WorldPlan) -> None:
+    assert len(plan.sites) >= 4
+    for site in plan.sites:
+        for other in [*plan.buildings, *(s for s in plan.sites if s is not site)]:
+            away = np.hypot(*np.subtract(site.centre, other.centre))
+            assert away > 0.5 * min(site.width, other.width)
+
+
+def test_buildings_go_change_and_come_in_the_shares_that_are_said(plan: WorldPlan) -> None:
+    after = apply_changes(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
+    before = {b.centre: b for b in plan.buildings}
+    count = len(before)
+    kept = [b for b in after.buildings if before.get(b.centre) == b]
+    rebuilt = [b for b in after.buildings if b.centre in before and before[b.centre] != b]
+    new = [b for b in after.buildings if b.centre not in before]
+    assert len(new) == min(round(0.04 * count), len(plan.sites))
+    assert count - len(kept) - len(rebuilt) == pytest.approx(0.2 * count, rel=0.5)
+    assert len(rebuilt) == pytest.approx(0.2 * count, rel=0.5)
+    assert all(b.eaves_m != before[b.centre].eaves_m for b in rebuilt)
+    assert len(after.trees.xy) == pytest.approx(0.7 * len(plan.trees.xy), rel=0.15)
+    assert after.trees.radius.mean() > plan.trees.radius.mean()
+    assert after.shapes is plan.shapes  # streets and fields stay
+    again = apply_changes(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
+    assert again.buildings == after.buildings
+
+
+def test_a_survey_moves_its_surface_smoothly_and_by_what_is_said() -> None:
+    survey = SurveyErrors(bumps_m=0.1, seed=4)
+    points = np.random.default_rng(0).uniform(-200, 200, (4000, 3))
+    off = survey.displaced(points) - points
+    np.testing.assert_allclose(off.std(axis=0), 0.1, rtol=0.35)
+    beside = survey.displaced(points + 0.2) - points - 0.2
+    assert np.abs(beside - off).max() < 0.1  # no tears
+    assert SurveyErrors().displaced(points) is points
+
+
+def test_every_place_is_surveyed_and_lived_in_its_own_way() -> None:
+    pairs = [survey_and_flight_visits(WorldConfig(seed, 400.0)) for seed in range(6)]
+    assert len({survey.survey for survey, _ in pairs}) == 6
+    for survey, live in pairs:
+        assert survey.changes is None
+        assert live.survey is None
+        assert min(live.changes.gone, live.changes.rebuilt, live.changes.new) >= 0.01
+        assert live.look.changed_buildings == 0.0

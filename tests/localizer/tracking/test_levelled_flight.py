@@ -54,7 +54,6 @@ def _filmed(small_assets: FlightAssets, above_m: float, count: int) -> list[tupl
         camera = WorldCamera(NumbaRenderer(streamer), CAMERA, Appearance(), options)
         for k in range(1, count + 1):
             exposed = camera.expose(k * PERIOD_NS, track)
-            assert exposed is not None
             frame = Frame(exposed.image, exposed.time_ns, CAMERA, k)
             seen.append((frame, exposed.world_from_camera))
     finally:

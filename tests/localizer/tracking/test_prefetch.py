@@ -1,13 +1,26 @@
 """Features ahead: what is prepared, when, and that no frame grows old in between."""
 
+from __future__ import annotations
+
 import threading
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from localizer.config import LocalizerConfig
+from localizer.errors import MapLoadingError, ModelError, OutsideMapError, RenderError
 from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.registration.config import JNGOConfig
+from localizer.render import select
+from localizer.tracking.engine_health import HealthCounters
+from localizer.tracking.mailbox import Mailbox
+from localizer.tracking.opening import MapStack, build_localizer
+from localizer.tracking.pipeline import Localizer
 from localizer.tracking.prefetch import FeaturePrefetcher, ProcessingTimes
-from localizer.types import FeaturePyramid, Frame
+from localizer.types import FeaturePyramid, Frame, PosePrior
 
 CAMERA = Camera.from_fov(64, 48, 60.0)
 AT_ONCE = 0.0
@@ -41,7 +54,6 @@ def test_the_next_frame_is_prepared_while_the_one_before_is_worked_on(extraction
     stage.put(_frame(0))
     stage.prepare(AT_ONCE)
     taken = stage.take(AT_ONCE)
-    assert taken is not None
     assert taken.features is not None
     stage.put(_frame(1))
     stage.prepare(AT_ONCE)  # the taker has not come back yet
@@ -114,3 +126,106 @@ def test_closing_wakes_both_sides(extraction):
     for thread in threads:
         thread.join(30.0)
         assert not thread.is_alive()
+
+
+# --- A view of which nothing is in memory yet is no view off the map ----------------------------
+
+
+def test_a_map_that_is_being_loaded_is_told_as_that() -> None:
+    """Each start warned that the view does not meet the map."""
+    camera = Camera.from_fov(320, 240, 60)
+    empty: Any = SimpleNamespace(depth=np.zeros((240, 320), np.float32))
+    renderer: Any = SimpleNamespace(render=lambda *_, **__: empty)
+    optimizer: Any = SimpleNamespace(on_gpu=True)
+    loading = [True]
+    localizer = Localizer(
+        renderer, None, optimizer, camera, LocalizerConfig(odometry=None),  # type: ignore[arg-type]
+        is_loading=lambda: loading[0],
+    )  # fmt: skip
+    prior = PosePrior.around(Pose.identity())
+    with pytest.raises(MapLoadingError, match="is being loaded"):
+        localizer.make_reference(prior)
+    loading[0] = False
+    with pytest.raises(OutsideMapError, match="does not meet the map"):
+        localizer.make_reference(prior)
+
+
+def test_an_engine_says_that_the_map_is_loading():
+    book = HealthCounters("", "")
+    book.report(MapLoadingError("the map is being loaded"))
+    assert book.read(0, "").map_loading
+    book.report(OutsideMapError("the view does not meet the map"))
+    assert not book.read(0, "").map_loading
+
+
+# --- mailbox ------------------------------------------------------------------------------------
+
+
+def test_newest_wins_and_drops_are_counted():
+    box: Mailbox[int] = Mailbox()
+    for item in (1, 2, 3):
+        box.put(item)
+    assert box.take() == 3
+    assert box.dropped == 2
+    assert box.take(timeout_s=0.01) is None
+
+
+def test_close_wakes_a_waiting_reader():
+    box: Mailbox[int] = Mailbox()
+    got = []
+    reader = threading.Thread(target=lambda: got.append(box.take()))
+    reader.start()
+    box.close()
+    reader.join(timeout=60)
+    assert got == [None]
+
+
+def test_the_producers_failure_reaches_the_consumer_over_an_item_that_waits():
+    box: Mailbox[int] = Mailbox()
+    assert box.put(1)
+    box.close(ValueError("the stream broke"))
+    box.close(RuntimeError("later"))
+    with pytest.raises(ValueError, match="the stream broke"):
+        box.take()
+    assert not box.put(2)
+    assert box.dropped == 0
+
+
+# --- The parts that `run` and `eval` share, from a configuration --------------------------------
+
+
+def test_the_configured_renderer_serves(small_assets):
+    stack = MapStack(small_assets.map_cache, LocalizerConfig(renderer="numba", threads=1))
+    assert stack.renderer.name == "numba (CPU, 1 threads)"
+    stack.close()
+
+
+def test_opengl_serves_where_it_is_asked_for(small_assets):
+    try:
+        stack = MapStack(small_assets.map_cache, LocalizerConfig(renderer="moderngl"))
+    except RenderError as error:
+        pytest.skip(str(error))
+    stack.renderer.warm_up()
+    assert stack.renderer.name.startswith("moderngl (")
+    stack.close()
+
+
+def test_a_renderer_that_is_not_there_is_named_and_leaves_no_thread(small_assets, monkeypatch):
+    def missing(*_args, **_options):
+        raise RenderError("moderngl is not installed")
+
+    monkeypatch.setattr(select, "make_renderer", missing)
+    before = threading.active_count()
+    with pytest.raises(RenderError, match="not installed"):
+        MapStack(small_assets.map_cache, LocalizerConfig(renderer="moderngl"))
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize("iterations", [(4, 4), (4, 4, 4, 4)])
+def test_a_model_of_another_number_of_levels_ends_the_start(small_assets, iterations):
+    registration = JNGOConfig(iterations=iterations)
+    config = LocalizerConfig(renderer="numba", threads=1, registration=registration)
+    stack = MapStack(small_assets.map_cache, config)
+    with pytest.raises(ModelError, match="the model has 3 levels"):
+        build_localizer(stack, Camera(64, 48, 60.0, 60.0, 32.0, 24.0), config)
+    stack.close()

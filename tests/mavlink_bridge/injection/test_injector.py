@@ -142,17 +142,6 @@ def test_what_is_sent_between_fixes_makes_none_of_them_late(fix_hz, latency_ms):
     assert len(steady) / 6 >= 19  # the steady rate is kept
 
 
-def test_a_fix_that_does_not_come_is_not_waited_for_long() -> None:
-    it = injector(rate_hz=20, delay_ms=220)
-
-    def every_third_missing(f: VisionFix) -> VisionFix | None:
-        return None if f.time_ns // (100 * MS) % 3 == 0 else f
-
-    sent = fly(it, seconds=8, fix_hz=10, latency_ms=190, speed=5.0, change=every_third_missing)
-    gaps = np.diff([t for t, _ in sent if t > 3 * SECOND]) / MS
-    assert gaps.max() <= 110.0  # of the 300 after which ArduPilot calls vision unhealthy
-
-
 def test_rate_never_passes_what_ardupilot_drops() -> None:
     it = injector(rate_hz=30, delay_ms=100)
     sent = fly(it, seconds=3, fix_hz=90, latency_ms=50)
@@ -196,7 +185,6 @@ def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
     assert sigmas[0] < 0.7
     assert 1.5 < sigmas[-1] <= 2.0
     assert it.counters["withheld_covariance"] > 10
-    assert it.reason is not None
     assert it.reason.id in (AlertId.SIGMA_OVER_LIMIT, AlertId.NO_FRESH_FIX)
 
 
@@ -253,7 +241,6 @@ def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
     sent = None
     for t in range(SECOND + 21 * MS, SECOND + 200 * MS, MS):
         sent = sent or it.step(t, context())
-    assert sent is not None
     assert sent.message.reset_counter == 1
     assert sent.message.x == pytest.approx(10.0, abs=0.1)
 

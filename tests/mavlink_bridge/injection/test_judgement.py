@@ -5,20 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.config import SourceSwitchConfig
+from mavlink_bridge.alerts.words import RcChannel
+from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.gnss_return import GnssReturnCheck
 from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
+from mavlink_bridge.injection.fix_warnings import FixWarnings
+from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScorer
 from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.profile import ARDUPILOT, GENERIC, FirmwareProfile
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -161,9 +168,7 @@ def test_followed_position_is_used() -> None:
 )
 def test_reason_in_one_line(options: dict[str, Any], reason: AlertId) -> None:
     verdict = looped(**options)
-    assert verdict is not None
     assert not verdict.used
-    assert verdict.reason is not None
     assert verdict.reason.id is reason
 
 
@@ -288,7 +293,6 @@ def test_no_return_to_a_far_receiver_of_which_nobody_says_that_it_is_bad() -> No
 def test_no_switch_without_a_go_of_the_shadow_score(how: dict[str, Any]) -> None:
     switch = SourceSwitch(CONFIG)
     assert drive(switch, 10.0, proven=False, **how) == []
-    assert switch.refusal is not None
     assert switch.refusal.values[2] == "not ready"
 
 
@@ -376,7 +380,6 @@ def test_a_right_receiver_is_accepted(speed: float, claimed: float | None) -> No
 def test_a_wrong_receiver_is_refused_with_its_reason(how: dict[str, Any], why: str) -> None:
     check = returned(**how)
     assert not check.accepted
-    assert check.refusal is not None
     assert check.refusal.why == why
 
 
@@ -388,3 +391,72 @@ def test_what_was_refused_is_not_taken_when_vision_ends() -> None:
     assert drive(switch, 20.0, 10.0, north=20.0, seen=False) == []
     drive(switch, 5.0, 30.0, gps=False, seen=False)
     assert [o.source_set for _, o in drive(switch, 8.0, 35.0, seen=False)] == [1]
+
+
+# --- Who opens and closes the gate of mode ``rc``: the newest word of channel or command --------
+
+
+COMMAND = mavlink.MAV_CMD_USER_1
+
+
+def enable(**options: object) -> tuple[InjectionEnable, list[Alert]]:
+    told: list[Alert] = []
+    return InjectionEnable(InjectionEnableConfig(**options), told.append), told  # type: ignore[arg-type]
+
+
+def channels(pulse: int, count: int = 18) -> tuple[int, ...]:
+    return tuple(pulse if i == 9 else 1500 for i in range(1, count + 1))
+
+
+def test_channel_is_followed_and_each_change_is_told_once() -> None:
+    it, told = enable()
+    for pulse in (1100, 1100, 1900, 1900, 1100, 1100):
+        it.on_rc_channels(channels(pulse))
+    assert told == [
+        alert(of, by=RcChannel(9)) for of in (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
+    ]
+
+
+def test_a_pulse_at_the_threshold_does_not_flutter() -> None:
+    it, told = enable(inject_above_us=1700)
+    for pulse in (1690, 1705, 1690, 1702, 1655):
+        it.on_rc_channels(channels(pulse))
+    assert told == [alert(AlertId.INJECTION_ON, by=RcChannel(9))]
+    it.on_rc_channels(channels(1640))
+    assert not it.enabled
+
+
+def test_the_newest_word_counts() -> None:
+    it, _ = enable()
+    assert it.command(COMMAND, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    it.on_rc_channels(channels(1100))  # the first look at a switch that is off is no word
+    assert it.enabled
+    it.on_rc_channels(channels(1900))
+    assert it.command(COMMAND, 0.0) == mavlink.MAV_RESULT_ACCEPTED
+    it.on_rc_channels(channels(1900))  # still on, not moved
+    assert not it.enabled
+    it.on_rc_channels(channels(1100))
+    it.on_rc_channels(channels(1900))
+    assert it.enabled
+
+
+# --- What is told of the firmware ---------------------------------------------------------------
+
+
+def told(message: Any, profile: FirmwareProfile) -> set[AlertId]:
+    told: dict[str, Alert | None] = {}
+    config = SimpleNamespace(injection=InjectionConfig(message=message))
+    shared: Any = SimpleNamespace(config=config, utc=None)
+    notifier: Any = SimpleNamespace(notify=told.__setitem__)
+    unused: Any = None
+    warnings = FixWarnings(shared, unused, notifier)
+    warnings.check_firmware(VehicleState(connected=True, version=(1, 0, 0)), profile)
+    return {problem.id for problem in told.values() if problem is not None}
+
+
+def test_unknown_firmware_does_not_hide_that_it_does_not_take_the_message() -> None:
+    both = {AlertId.UNKNOWN_FIRMWARE, AlertId.MESSAGE_UNSUPPORTED}
+    assert told("odometry", GENERIC) == both
+    assert told("vision_position_estimate", GENERIC) == {AlertId.UNKNOWN_FIRMWARE}
+    assert told("global_position_sensor", ARDUPILOT) == {AlertId.MESSAGE_UNSUPPORTED}
+    assert told("odometry", ARDUPILOT) == set()

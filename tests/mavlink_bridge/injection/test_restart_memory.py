@@ -59,7 +59,6 @@ def left_open(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     child = subprocess.Popen(
         [sys.executable, "-c", _CHILD, *map(str, files.values())], stdout=subprocess.PIPE, text=True
     )
-    assert child.stdout is not None
     assert child.stdout.readline() == "open\n"
     os.kill(child.pid, signal.SIGKILL)
     child.wait()

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig
-from mavlink_bridge.config import InjectionConfig, SigningConfig, TargetsConfig
+from mavlink_bridge.config import SigningConfig
 from mavlink_bridge.errors import BridgeStateError, EndpointError
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
@@ -226,12 +226,6 @@ def test_a_link_that_sends_first_hears_only_whom_it_sends_to(monkeypatch, speake
     ours.close()
 
 
-@pytest.mark.parametrize("text", ["vehicle", "10.0.0.1:", "10.0.0.1:0", "10.0.0.1:70000", "::1"])
-def test_what_is_no_sender_is_named(text: str) -> None:
-    with pytest.raises(ValidationError, match=r"sender|port"):
-        BridgeConfig(sender=text)
-
-
 def test_a_second_process_cannot_take_a_udp_port_over() -> None:
     """As `companion doctor` would in flight: the last socket bound gets the datagrams."""
     first = open_transport(Endpoint.parse("udpin:127.0.0.1:0"))
@@ -246,13 +240,33 @@ def test_port_out_of_range() -> None:
         Endpoint.parse("tcp:host:70000")
 
 
-def test_configuration_refuses_what_cannot_work() -> None:
-    with pytest.raises(ValidationError, match="rate_hz >= 5"):
-        InjectionConfig(message="gps_input", rate_hz=4.0)
-    with pytest.raises(ValidationError, match="needs ground_connection"):
-        BridgeConfig(targets=TargetsConfig(adsb=True))
-    with pytest.raises(ValidationError, match="extra"):
-        BridgeConfig(conection="tcp:localhost:1")  # type: ignore[call-arg]
+NO_SENDERS = ("vehicle", "10.0.0.1:", "10.0.0.1:0", "10.0.0.1:70000", "::1")
+ONE_PEER = ("tcp:127.0.0.1:5760", "udpout:127.0.0.1:14550")
+WITHOUT_SET = ("global_position_sensor", "external_position_estimate")
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        *(({"sender": text}, "sender|port") for text in NO_SENDERS),
+        # It was ignored without a word, and looked like a guard.
+        *(({"sender": "127.0.0.1", "connection": text}, "udpin") for text in ONE_PEER),
+        *(({"injection": {"message": kind}, "switch": {"enabled": True}},
+           f"{kind}.*no source set: remove switch.enabled") for kind in WITHOUT_SET),
+        ({"injection": {"message": "gps_input", "rate_hz": 4.0}}, "rate_hz >= 5"),
+        ({"targets": {"adsb": True}}, "needs ground_connection"),
+        ({"targets": {"cot_aircraft": True}}, r"needs targets\.cot_endpoint"),
+        # It would come back through the autopilot.
+        ({"texts_as_autopilot": True}, "texts_as_autopilot needs ground_connection"),
+        ({"conection": "tcp:localhost:1"}, "extra"),
+    ],
+)  # fmt: skip
+def test_a_configuration_that_cannot_work_is_refused(options: dict[str, Any], why: str) -> None:
+    with pytest.raises(ValidationError, match=why):
+        BridgeConfig(**options)
+
+
+def test_a_mode_off_of_yaml_is_no_boolean() -> None:
     assert BridgeConfig(mode=False).mode == "off"  # type: ignore[arg-type]
 
 
@@ -334,7 +348,6 @@ def test_tcp_server_takes_a_client(start: Callable[..., tuple[Link, Recorder]]) 
             return client is not None and link.connected
 
         assert sleep_until(connected, 60.0, step_s=0.05)
-        assert client is not None
         client.sendall(packed())
         assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
         client.close()
@@ -537,10 +550,3 @@ def test_a_key_file_that_changes_while_the_link_runs_changes_nothing(fate, tmp_p
             assert heard(server, reader)
             assert int(bridge.counters()["fc_opened"] or 0) >= 2
     assert reader.counters.bad_signatures == 0
-
-
-@pytest.mark.parametrize("connection", ["tcp:127.0.0.1:5760", "udpout:127.0.0.1:14550"])
-def test_a_sender_where_there_is_one_peer_is_refused(connection: str) -> None:
-    """It was ignored without a word, and looked like a guard."""
-    with pytest.raises(ValidationError, match="udpin"):
-        BridgeConfig(connection=connection, sender="127.0.0.1")

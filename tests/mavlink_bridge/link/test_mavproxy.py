@@ -62,7 +62,6 @@ class Console:
         self.lines.extend(self._process.stdout)
 
     def ask(self, command: str) -> None:
-        assert self._process.stdin is not None
         self._process.stdin.write(command + "\n")
         self._process.stdin.flush()
 

@@ -416,14 +416,6 @@ def test_px4_is_asked_for_its_own_failsafes_and_has_no_source_sets(autopilot, mo
     assert (finding.ok, finding.required) == (False, True)
 
 
-@pytest.mark.parametrize("message", ["global_position_sensor", "external_position_estimate"])
-def test_what_is_fused_beside_gnss_is_not_switched_to(message: Any) -> None:
-    with pytest.raises(ValueError, match=f"{message}.*no source set: remove switch.enabled"):
-        BridgeConfig(
-            injection=InjectionConfig(message=message), switch=SourceSwitchConfig(enabled=True)
-        )
-
-
 def test_a_vehicle_without_these_parameters_gets_no_such_line(autopilot: Any) -> None:
     assert check_failsafes(config(), {}.get) == []
     assert check_failsafes(config().model_copy(update={"mode": "off"}), GOOD.get) == []

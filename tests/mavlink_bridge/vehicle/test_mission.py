@@ -85,12 +85,6 @@ def test_it_is_read_once_and_its_number_asked_for_now_and_then() -> None:
     assert talk.run(60.0) == ["MISSION_REQUEST_LIST"] * 6
 
 
-def test_nobody_asks_until_somebody_wants_to_show_it() -> None:
-    talk = Conversation(ITEMS)
-    talk.watch.wanted = False
-    assert talk.run(60.0) == []
-
-
 @pytest.mark.parametrize("change", ["shorter", "armed", "mode", "reboot"])
 def test_it_is_read_again_when_it_may_be_another(change: str) -> None:
     talk = Conversation(ITEMS)

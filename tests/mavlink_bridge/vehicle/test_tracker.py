@@ -59,7 +59,6 @@ def test_attitude_is_interpolated_across_the_wrap_of_yaw() -> None:
     feed_yaw(it, 10.0, 8.0, math.radians(60.0))
     for ms in (2950, 3020, 3333, 6666):
         at = it.attitude_at(10 * SECOND + ms * MS)
-        assert at is not None
         expected = quat.wrap_pi(math.radians(60.0) * ms / 1000)
         assert quat.wrap_pi(at.yaw_rad - expected) == pytest.approx(0.0, abs=1e-4)
 
@@ -69,7 +68,6 @@ def test_attitude_is_extrapolated_a_little_and_not_more() -> None:
     feed_yaw(it, 10.0, 1.0, 0.5)
     newest = 10 * SECOND + 900 * MS
     at = it.attitude_at(newest + 80 * MS)
-    assert at is not None
     assert at.yaw_rad == pytest.approx(0.5 * 0.98, abs=1e-4)
     assert it.attitude_at(newest + 200 * MS) is None
     assert it.attitude_at(10 * SECOND - 50 * MS) is None
@@ -84,8 +82,6 @@ def test_gyro_heading_follows_the_turn_and_ignores_resets_of_the_estimator() -> 
         m = mavlink.MAVLink_attitude_message(int(t * 1000), 0.0, 0.0, estimated, 0.0, 0.0, rate)
         it.handle(sent(m), 10 * SECOND + int(t * SECOND))
     early, late = (it.attitude_at(10 * SECOND + ms * MS) for ms in (1000, 9000))
-    assert early is not None
-    assert late is not None
     assert late.gyro_heading_rad - early.gyro_heading_rad == pytest.approx(rate * 8.0, abs=1e-3)
 
 
@@ -105,7 +101,6 @@ def test_attitude_quaternion_message() -> None:
         sent(mavlink.MAVLink_attitude_quaternion_message(5000, *q, 0.0, 0.0, 0.0)), 10 * SECOND
     )
     at = it.attitude_at(10 * SECOND)
-    assert at is not None
     assert (at.roll_rad, at.pitch_rad, at.yaw_rad) == pytest.approx((0.1, -0.2, 2.0), abs=1e-6)
 
 
@@ -138,7 +133,6 @@ def test_gimbal_frame_by_yaw_in_flags_first_then_yaw_lock(flags, earth, quaterni
         )
         it.handle(sent(gimbal), 10 * SECOND + ms * MS)
     at = it.gimbal_at(10 * SECOND + 150 * MS)
-    assert at is not None
     yaw = 30.0 if earth else 130.0
     assert math.degrees(at.yaw_rad) == pytest.approx(yaw, abs=1e-3)
     assert math.degrees(at.pitch_rad) == pytest.approx(-45.0, abs=1e-3)
@@ -157,7 +151,6 @@ def test_old_mount_messages_are_used_only_without_the_new_one(quaternion_of: Qua
     for ms in (0, 100, 200):
         attitude_and(it, ms, mount, yaw=math.radians(10.0))
     at = it.gimbal_at(10 * SECOND + 100 * MS)
-    assert at is not None
     assert at.source == "MOUNT_STATUS"
     assert math.degrees(at.pitch_rad) == pytest.approx(-30.0, abs=1e-3)
     assert math.degrees(at.roll_rad) == pytest.approx(1.0, abs=1e-3)
@@ -168,7 +161,6 @@ def test_old_mount_messages_are_used_only_without_the_new_one(quaternion_of: Qua
     attitude_and(it, 300, device, mount)
     attitude_and(it, 400, mount)
     at = it.gimbal_at(10 * SECOND + 350 * MS)
-    assert at is not None
     assert at.source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
 
 
@@ -177,7 +169,6 @@ def test_fixed_camera_follows_the_body_and_its_mounting() -> None:
     m = mavlink.MAVLink_attitude_message(0, 0.0, math.radians(10.0), 1.0, 0.0, 0.0, 0.0)
     it.handle(sent(m), 10 * SECOND)
     at = it.gimbal_at(10 * SECOND)
-    assert at is not None
     assert math.degrees(at.pitch_rad) == pytest.approx(-50.0, abs=1e-3)
     assert at.yaw_rad == pytest.approx(1.0, abs=1e-6)
     assert at.source == "fixed"
@@ -236,7 +227,6 @@ def test_what_is_not_finite_or_old_is_ignored() -> None:
     assert state.local_position_ned is None
     assert state.latitude_deg is None
     at = it.attitude_at(now - 100 * MS)
-    assert at is not None
     assert math.isfinite(at.yaw_rad)
     # A copy of an old frame does not turn the position back.
     good = mavlink.MAVLink_local_position_ned_message(1000, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -315,7 +305,6 @@ def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     # The vehicle has another one: ours is ignored, and so must positions be relative to the read.
     read = mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000)
     news = keeper.on_origin(read, armed=True)
-    assert news is not None
     assert news.id is AlertId.ORIGIN_DIFFERS
     assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
     assert keeper.tick(10 * SECOND, 1, asked.append) is None
@@ -376,7 +365,6 @@ CAMERA_GIMBAL, OTHER_GIMBAL = (1, 1), (1, 2)
 
 def looks(it: VehicleTracker, at_ms: int) -> float:
     gimbal = it.gimbal_at(10 * SECOND + at_ms * MS)
-    assert gimbal is not None
     return math.degrees(gimbal.yaw_rad)
 
 

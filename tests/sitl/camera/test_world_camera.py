@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import socket
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -11,6 +14,7 @@ import pytest
 from companion.geometry import GimbalAngles, Mount, camera_attitude, world_from_camera
 from companion.offline.tables import poses, read_columns
 from companion.sources import open_source
+from companion.sources.zoom import ZoomTable, with_focal_factor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, matrix_from_quaternion, so3_exp
@@ -20,11 +24,14 @@ from localizer.geometry.trajectory import read_tum
 from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
+from sitl.camera.detector import Detector, DetectorErrors, DetectorView, FixedPoint
 from sitl.camera.distortion import RenderedLens
 from sitl.camera.movers import Mover
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera, centre_flow
+from sitl.camera.zoom import Zooming, ZoomLens, level_of
 from sitl.demo.sequence import record_sequence
+from sitl.suite.loop.case import load_loop_cases
 
 CAMERA = Camera(320, 240, 230.0, 232.0, 163.0, 118.0, (-0.12, 0.03, 0.002, -0.001, -0.004))
 HALF_M = 200.0
@@ -133,7 +140,6 @@ def test_a_mover_is_drawn_at_its_true_place(renderer: NumbaRenderer) -> None:
     track = PoseTrack([(0, _pose()), (10 * 10**9, _pose())])
     for time_ns in (500_000_000, 3_000_000_000):
         exposure = camera.expose(time_ns, track)
-        assert exposure is not None
         image = exposure.image.astype(int)
         mask = (image[..., 0] > 150) & (image[..., 1] < 80)
         v, u = np.nonzero(mask)
@@ -154,7 +160,6 @@ def test_the_blur_is_the_motion_during_the_shutter(renderer: NumbaRenderer) -> N
     def sharpness(track: PoseTrack, shutter_s: float) -> float:
         camera = WorldCamera(renderer, CAMERA, Appearance(), CameraOptions(shutter_s=shutter_s))
         exposure = camera.expose(50_000_000, track)
-        assert exposure is not None
         return float(np.abs(np.diff(exposure.image.astype(float), axis=1)).max())
 
     moving = _track(still, turned)
@@ -199,3 +204,120 @@ def test_the_frame_log_is_read_by_the_analysis(tmp_path: Path) -> None:
     tum = read_tum(tmp_path / "truth.tum")
     assert [p.time_ns for p in tum] == columns["exposure_time_ns"].tolist()
     assert tum[1].world_from_camera.distance_to(pose)[0] < 1e-6
+
+
+# --- zoom ---------------------------------------------------------------------------------------
+
+
+CAMERA_ZOOM = Camera(160, 120, 150.0, 150.0, 78.0, 61.0, (-0.1, 0.02, 0.0, 0.0, 0.0))
+
+
+def dot_at(image: np.ndarray) -> tuple[float, float]:
+    """Centre of what is bright, with pixel centres at (u + 0.5, v + 0.5)."""
+    weight = image[..., 0].astype(float)
+    rows, columns = np.indices(weight.shape) + 0.5
+    return float((columns * weight).sum() / weight.sum()), float(
+        (rows * weight).sum() / weight.sum()
+    )
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.2, 1.4])
+def test_what_it_shows_lies_where_the_longer_camera_has_it(factor: float) -> None:
+    point = np.array([0.15, -0.1, 1.0])
+    image = np.zeros((120, 160, 3), np.uint8)
+    pixel, _ = CAMERA_ZOOM.project(point)
+    image[int(pixel[1]), int(pixel[0])] = 255
+    ray = CAMERA_ZOOM.rays([int(pixel[0]) + 0.5, int(pixel[1]) + 0.5])
+    lens = ZoomLens(CAMERA_ZOOM)
+    lens.set(Zooming(1.0, factor, 0, 10))
+    wanted, _ = with_focal_factor(CAMERA_ZOOM, factor).project(ray)
+    assert dot_at(lens.apply(image, 20)) == pytest.approx(tuple(wanted), abs=0.3)
+
+
+def test_it_moves_between_its_begin_and_its_end() -> None:
+    zooming = Zooming(1.0, 1.4, 100, 200)
+    assert [zooming.at(t) for t in (0, 150, 900)] == pytest.approx([1.0, 1.2, 1.4])
+    assert level_of(zooming.at(900)) == pytest.approx(40.0)
+
+
+def test_the_scenarios_table_is_near_the_lens_and_not_the_same() -> None:
+    (case,) = load_loop_cases(["normal-zooms-told"])
+    table = ZoomTable(points=case.zoom_points)
+    off = [abs((table.factor(level_of(f)) or 0.0) / f - 1.0) for f in np.linspace(1.0, 2.0, 41)]
+    assert 0.003 < max(off) < 0.007
+    assert case.is_normal
+    (unreported,) = load_loop_cases(["zooms-untold"])
+    assert not unreported.is_normal
+    assert unreported.needs_shadow_check
+
+
+# --- The simulated operator's eye: what it can see, and the errors that it makes ----------------
+
+
+CAMERA_DETECTOR = Camera.from_fov(320, 240, 60.0)
+# 50 m up, looking down: x east, y south.
+POSE = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 50.0]))
+EXACT = DetectorErrors(noise_px=0.0)
+
+
+@pytest.fixture
+def listener():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        s.settimeout(2.0)
+        yield s
+
+
+def _eye(listener, targets, errors=EXACT):
+    return Detector(
+        f"127.0.0.1:{listener.getsockname()[1]}", CAMERA_DETECTOR, targets, errors, seed=1
+    )
+
+
+def _view(depth=50.0, time_ns=7, pose_of_row=lambda _: POSE):
+    return DetectorView(time_ns, np.full((240, 320), depth, np.float32), pose_of_row)
+
+
+def test_a_visible_target_is_sent_where_it_projects(listener):
+    eye = _eye(listener, [FixedPoint("a", np.array([4.0, 3.0, 0.0]))])
+    (seen,) = eye.observe(_view(), stamp_ns=11)
+    pixel, _ = CAMERA_DETECTOR.project(POSE.inverse.apply(np.array([4.0, 3.0, 0.0])))
+    assert (seen.u, seen.v) == pytest.approx(pixel)
+    message = json.loads(listener.recv(2000))
+    assert message["time_ns"] == 11  # of the frame in the stream, not of its exposure
+    eye.close()
+
+
+@pytest.mark.parametrize(
+    ("place", "depth"),
+    [
+        ((4.0, 3.0, 0.0), 40.0),  # behind a roof 10 m above it
+        ((400.0, 3.0, 0.0), 50.0),  # outside
+        ((28.8, 0.0, 0.0), 50.0),  # on the very edge of the picture
+        ((0.0, 0.0, 60.0), 50.0),  # above the camera
+    ],
+)
+def test_what_nobody_could_see_is_not_reported(listener, place, depth):
+    eye = _eye(listener, [FixedPoint("a", np.array(place))])
+    assert eye.observe(_view(depth)) == []
+    eye.close()
+
+
+def test_misses_false_ones_and_exchanged_names_come_as_often_as_said(listener):
+    places = {"a": np.array([4.0, 3.0, 0.0]), "b": np.array([-6.0, -5.0, 0.0])}
+    errors = DetectorErrors(noise_px=0.0, missed=0.2, false=0.1, swapped=0.15)
+    eye = _eye(listener, [FixedPoint(n, p) for n, p in places.items()], errors)
+    true = {n: CAMERA_DETECTOR.project(POSE.inverse.apply(p))[0] for n, p in places.items()}
+    count: Counter[str] = Counter()
+    for _ in range(2000):
+        for d in eye.observe(_view()):
+            if d.target_id.startswith("no-target"):
+                count["false"] += 1
+                continue
+            near = [n for n, p in true.items() if np.hypot(d.u - p[0], d.v - p[1]) < 0.01]
+            count["right" if near == [d.target_id] else "swapped"] += 1
+    seen = 2 * 2000 * 0.8
+    assert count["false"] == pytest.approx(2000 * 0.1 * 0.96, rel=0.25)
+    assert count["swapped"] == pytest.approx(2 * 2000 * 0.64 * 0.15, rel=0.25)
+    assert count["right"] == pytest.approx(seen - count["swapped"], rel=0.08)
+    eye.close()

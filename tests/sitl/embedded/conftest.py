@@ -111,7 +111,6 @@ class Bench:
     def ekf_error(self) -> float:
         """Horizontal metres between estimate and truth."""
         v = self.vehicle
-        assert v.estimator.origin is not None
         n, e, _ = v.estimator.origin.ned_of(v.true_location)
         return math.hypot(v.estimator.position[0] - n, v.estimator.position[1] - e)
 
@@ -150,7 +149,6 @@ class Bench:
         """Guided target about home; does not wait."""
         v = self.vehicle
         origin = v.estimator.origin
-        assert origin is not None
         down = v.modes.home.altitude_m if v.modes.home else HOME.altitude_m
         n, e, _ = origin.ned_of(HOME)
         z = origin.altitude_m - down - height

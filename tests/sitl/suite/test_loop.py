@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mavlink_bridge.alerts.catalogue import alert, text
+from mavlink_bridge.alerts.catalogue import cleared as cleared_alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Output
 from sitl.__main__ import app
@@ -31,6 +32,7 @@ from sitl.suite.loop.evaluation import (
     false_alarms,
     figures,
     longest_unreported_s,
+    standing_alerts,
 )
 from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
@@ -81,6 +83,25 @@ def test_every_expectation_can_fail() -> None:
     bad = evaluate(record(landed, errors=(0.2, 7.0)), replace_says(expect))
     assert [h.ok for h in bad] == [True, False, False, False, False, False, False]
     assert not evaluate(record((), errors=()), Expectation())[0].ok
+
+
+@pytest.mark.parametrize(("cleared", "ok"), [(False, True), (True, False)])
+def test_an_alert_raised_before_the_recorded_part_counts_while_it_stands(
+    cleared: bool, ok: bool
+) -> None:
+    """As map-shifted-interlock: the alert is sent seconds before GNSS is switched off."""
+    frozen = alert(AlertId.VIDEO_FROZEN, seconds=5.0)
+    before = (
+        Text(-3.0, 191, 4, text(frozen)),
+        Text(-2.0, 191, 6, text(cleared_alert(AlertId.VIDEO_FROZEN))),
+    )
+    standing = standing_alerts(before if cleared else before[:1])
+    flown = replace(record(flight([0.5] * 4)), texts=(), standing=standing)
+    expect = Expectation(reports=(AlertId.VIDEO_FROZEN,))
+    held = evaluate(flown, expect)[-1]
+    assert (held.ok, held.seen) == (ok, "at -3.0 s" if ok else "never")
+    only_end = replace(flown, standing=(), texts=(replace(before[1], at_s=1.0),))
+    assert not evaluate(only_end, expect)[-1].ok
 
 
 @pytest.mark.parametrize(("injects_s", "ok"), [(4.9, True), (5.1, False), (float("inf"), False)])
@@ -143,12 +164,10 @@ def row(alarms: tuple[str, ...] | None) -> LoopRow:
 def test_the_rate_of_false_alarms_has_its_exact_interval() -> None:
     """Against the tables of Clopper and Pearson: 0 of 20, and 1 of 20."""
     quiet = false_alarm_rate([row(())] * 20 + [row(None)])
-    assert quiet is not None
     assert (quiet.flights, quiet.with_alarm) == (20, 0)
     assert [quiet.low, quiet.high] == pytest.approx([0.0, 0.1684], abs=1e-4)
     assert quiet.hours == pytest.approx(20 * 20 / 3600)
     loud = false_alarm_rate([row(())] * 19 + [row((f"1.0 s: {FROZEN}",))])
-    assert loud is not None
     assert [loud.low, loud.high] == pytest.approx([0.0013, 0.2487], abs=1e-4)
     assert false_alarm_rate([row(None)]) is None
 

@@ -2,40 +2,27 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 from localizer.errors import MapSourceError
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.map.building import levels, quadtree
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.tiles3d import ContentFile
 from localizer.map.inspection.inspect import verify
 from localizer.render.numba_raster import NumbaRenderer
+from tests.localizer.map.conftest import write_tree
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 
 
 def write(make, folder, children, **root):
-    folder.mkdir(parents=True, exist_ok=True)
-    document = {
-        "asset": {"version": "1.0", "extras": {"geoid_separation_m": make.separation}},
-        "geometricError": 500.0,
-        "root": {
-            "boundingVolume": {"box": [0, 0, 0, 200, 0, 0, 0, 200, 0, 0, 0, 30]},
-            "geometricError": 500.0,
-            "transform": LocalFrame(make.origin).ecef_from_enu.matrix.T.ravel().tolist(),
-            "children": children,
-        }
-        | root,
-    }
-    path = folder / "tileset.json"
-    path.write_text(json.dumps(document))
-    return path
+    asset = {"version": "1.0", "extras": {"geoid_separation_m": make.separation}}
+    box = {"box": [0, 0, 0, 200, 0, 0, 0, 200, 0, 0, 0, 30]}
+    about = {"boundingVolume": box, "geometricError": 500.0, "children": children}
+    return write_tree(folder, about | root, asset=asset)
 
 
 @pytest.fixture

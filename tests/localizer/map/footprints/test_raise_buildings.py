@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import rasterio
 from pyproj import Transformer
-from rasterio.transform import from_origin
 
 from localizer.errors import MapSourceError
 from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
+from tests.localizer.map.conftest import write_raster
 
 CRS, LEFT, TOP, SIDE = "EPSG:25832", 462_000.0, 5_250_400.0, 60
 HOUSE = [(LEFT + x, TOP - y) for x, y in ((10.2, 10.3), (30.7, 12.1), (28.9, 25.4), (9.1, 22.8))]
@@ -32,12 +32,8 @@ def terrain(tmp_path: Path) -> Path:
 
 
 def write_terrain(path: Path, heights, crs: str = CRS, **more: object) -> Path:
-    with rasterio.open(
-        path, "w", driver="GTiff", crs=crs, dtype="float32", count=1, width=SIDE, height=SIDE,
-        transform=from_origin(LEFT, TOP, 1.0, 1.0), nodata=-9999.0, **more,
-    ) as file:  # fmt: skip
-        file.write(heights.astype(np.float32), 1)
-    return path
+    data = heights.astype(np.float32)
+    return write_raster(path, data, crs, place=(LEFT, TOP), nodata=-9999.0, **more)
 
 
 def geojson(path: Path, *features: tuple[dict, object], crs: str | None = None) -> Path:

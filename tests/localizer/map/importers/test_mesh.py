@@ -14,6 +14,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.georeference import Georeference, ecef_from_crs, read_georeference
+from localizer.map.importers.heightmesh import height_mesh
 from localizer.render.numba_raster import NumbaRenderer
 from tests.localizer.map.conftest import built
 
@@ -179,3 +180,40 @@ def test_caliterra_stands_where_its_photos_were_taken(real_data, build):
     drawn = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(float)
     assert shown.mean() > 0.8
     assert np.corrcoef(photo[shown], drawn[shown])[0, 1] > 0.9
+
+
+# --- Height fields to meshes: what simplification may take away, and what not -------------------
+
+
+_CELLS, _STEP = 32, 0.5
+
+
+def _made(seed: int, unknown: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    rough = np.random.default_rng(seed).normal(size=(_CELLS + 1, _CELLS + 1))
+    mask = np.zeros(rough.shape, bool)
+    if unknown is not None:
+        mask[unknown] = True
+    heights = np.ma.masked_array(0.02 * rough.cumsum(0).cumsum(1), mask)
+    made = height_mesh(heights, np.ones((64, 64), bool), (_STEP, _STEP), lossless=False)
+    assert made is not None
+    return made
+
+
+def _area(points: np.ndarray, faces: np.ndarray) -> float:
+    (x1, y1), (x2, y2) = ((points[faces[:, k], :2] - points[faces[:, 0], :2]).T for k in (1, 2))
+    return float((x1 * y2 - x2 * y1).sum() / 2)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_tile_keeps_its_corners(seed):
+    # Else the ground had a hole of about a metre wherever four such tiles meet.
+    points, faces = _made(seed)
+    side = _CELLS * _STEP
+    for corner in ((0, 0), (side, 0), (0, -side), (side, -side)):
+        assert np.abs(points[:, :2] - corner).max(axis=1).min() < 1e-6
+    assert _area(points, faces) == pytest.approx(side * side, rel=1e-6)
+
+
+def test_a_corner_that_nobody_knows_is_not_made_up():
+    points, _ = _made(0, unknown=(0, 0))
+    assert np.abs(points[:, :2]).max(axis=1).min() > 0.1 * _STEP

@@ -32,11 +32,12 @@ from localizer.map.importers.georeference import Georeference, read_georeference
 from localizer.map.importers.raster_checks import check_heights
 from localizer.map.importers.raster_file import METRES, offline, open_raster, require_sane
 from localizer.map.importers.rules import ImportRules
+from tests.localizer.map.conftest import ORIGIN as TILESET_ORIGIN
+from tests.localizer.map.conftest import PLACE, write_raster, write_tree
 
 UTM = "EPSG:32632"
-LEFT, TOP, STEP, CELLS = 500_100.0, 5_228_300.0, 1.0, 48
+(LEFT, TOP), STEP, CELLS = PLACE, 1.0, 48
 ORIGIN = Geodetic(47.2, 9.0, 400.0)
-TILESET_ORIGIN = Geodetic(47.2, 8.2, 430.0)
 ELLIPSOIDAL = {"vertical_datum": "ellipsoidal"}
 
 
@@ -45,35 +46,19 @@ def ground(n=CELLS, m=None):
     return (400 + 3 * np.sin(x / 9) + 2 * np.cos(y / 7)).astype(np.float32)
 
 
-def write(path, data, crs=UTM, step=STEP, place=(LEFT, TOP), **options):
-    data = data if data.ndim == 3 else data[None]
-    tags = {
-        k: options.pop(k) for k in ("units", "scales", "offsets", "colorinterp") if k in options
-    }
-    profile = {
-        "driver": "GTiff", "width": data.shape[2], "height": data.shape[1], "count": data.shape[0],
-        "dtype": data.dtype, "crs": crs, "transform": from_origin(*place, step, step),
-    } | options  # fmt: skip
-    with rasterio.open(path, "w", **profile) as out:
-        for name, value in tags.items():
-            setattr(out, name, value)
-        out.write(data)
-    return path
-
-
 def picture(n=CELLS, seed=0):
     return np.random.default_rng(seed).integers(30, 220, (3, n, n), dtype=np.uint8)
 
 
 def dsm_of(folder, data=None, **options):
-    return write(folder / "dsm.tif", ground() if data is None else data, **options)
+    return write_raster(folder / "dsm.tif", ground() if data is None else data, **options)
 
 
 def rasters(folder, data=None, ortho=None, **options):
     """A DSM as told, and an honest orthophoto."""
     ortho = dict(ortho or {})
     colours = ortho.pop("data", picture())
-    return [dsm_of(folder, data, **options), write(folder / "ortho.tif", colours, **ortho)]
+    return [dsm_of(folder, data, **options), write_raster(folder / "ortho.tif", colours, **ortho)]
 
 
 def with_hole(value, dtype=np.float32):
@@ -94,7 +79,7 @@ def sparse(folder, make):
         SPARSE_OK=True, BIGTIFF=True,
     ):  # fmt: skip
         pass
-    return [path, write(folder / "ortho.tif", picture())]
+    return [path, write_raster(folder / "ortho.tif", picture())]
 
 
 def cut_in_half(folder, make):
@@ -144,20 +129,8 @@ def pipe(folder, make):
 
 
 def tileset(folder, transform=None, name="tileset.json", **root):
-    T = LocalFrame(TILESET_ORIGIN).ecef_from_enu.matrix if transform is None else transform
-    document = {
-        "asset": {"version": "1.1"},
-        "geometricError": 10,
-        "root": {
-            "transform": np.asarray(T).T.ravel().tolist(),
-            "boundingVolume": {"sphere": [0, 0, 0, 100]},
-            "geometricError": 0,
-        }
-        | root,
-    }
-    path = folder / name
-    path.write_text(json.dumps(document))
-    return path
+    placed = {} if transform is None else {"transform": np.asarray(transform).T.ravel().tolist()}
+    return write_tree(folder, placed | root, name)
 
 
 def content(folder, make, scale=1.0, lift=0.0, **extra):
@@ -420,8 +393,8 @@ def test_beside_a_turned_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
     """Three vertices at its corners were 400 m below the ground."""
     turned = Affine.translation(LEFT, TOP) @ Affine.rotation(10) @ Affine.scale(1, -1)
     source = [
-        write(tmp_path / "dsm.tif", ground(80), transform=turned),
-        write(tmp_path / "ortho.tif", picture(80), transform=turned),
+        write_raster(tmp_path / "dsm.tif", ground(80), transform=turned),
+        write_raster(tmp_path / "ortho.tif", picture(80), transform=turned),
     ]
     low, high = heights_of(built(source, **ELLIPSOIDAL))
     assert 394 < low < high < 406

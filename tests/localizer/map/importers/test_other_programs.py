@@ -9,12 +9,10 @@ import struct
 import cv2
 import numpy as np
 import pytest
-import rasterio
 from pyproj import CRS
-from rasterio.transform import from_origin
 
 from localizer.errors import GeoreferenceError, MapSourceError
-from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
+from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
@@ -26,8 +24,8 @@ from localizer.map.importers.raster_file import offline, open_raster
 from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import read_tileset
+from tests.localizer.map.conftest import ORIGIN, write_raster, write_tree
 
-ORIGIN = Geodetic(47.2, 8.2, 430.0)
 BOX = [0, 0, 5, 60, 0, 0, 0, 60, 0, 0, 0, 20]
 COUNTRY = [*np.radians([5.9, 45.8, 10.5, 47.8]), 200.0, 4700.0]
 
@@ -49,14 +47,8 @@ def tileset(folder, data, uri="t.b3dm", name=None, asset=None, **root):
     folder.mkdir(exist_ok=True)
     (folder / (name or uri)).parent.mkdir(exist_ok=True)
     (folder / (name or uri)).write_bytes(data)
-    node = {
-        "boundingVolume": {"box": BOX}, "geometricError": 0, "content": {"uri": uri},
-        "transform": LocalFrame(ORIGIN).ecef_from_enu.matrix.T.ravel().tolist(),
-    } | root  # fmt: skip
-    node = {key: value for key, value in node.items() if value is not None}
-    document = {"asset": asset or {"version": "1.0"}, "geometricError": 50, "root": node}
-    (folder / "tileset.json").write_text(json.dumps(document))
-    return folder / "tileset.json"
+    node = {"boundingVolume": {"box": BOX}, "content": {"uri": uri}} | root
+    return write_tree(folder, node, asset=asset)
 
 
 def colours_of(source):
@@ -455,20 +447,8 @@ def test_a_mask_of_opacity_cuts_its_holes(tmp_path, make):
 
 
 def dsm(path, crs, version="1.0", **options):
-    data = np.full((1, 8, 8), 400, np.float32)
-    profile = {
-        "driver": "GTiff",
-        "width": 8,
-        "height": 8,
-        "count": 1,
-        "dtype": "float32",
-        "crs": crs,
-        "transform": from_origin(5e5, 5.2e6, 1, 1),
-        "GEOTIFF_VERSION": version,
-    }
-    with rasterio.open(path, "w", **profile, **options) as out:
-        out.write(data)
-    return path
+    data = np.full((8, 8), 400, np.float32)
+    return write_raster(path, data, crs, place=(5e5, 5.2e6), GEOTIFF_VERSION=version, **options)
 
 
 def stated(path):

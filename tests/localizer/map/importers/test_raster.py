@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import from_origin
 from rasterio.warp import Resampling, calculate_default_transform, reproject
 
 from localizer.errors import GeoreferenceError, MapSourceError
@@ -18,10 +17,10 @@ from localizer.map.cache.pick import cast_rays
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.georeference import ecef_from_crs
 from localizer.render.numba_raster import NumbaRenderer
-from tests.localizer.map.conftest import built
+from tests.localizer.map.conftest import PLACE, built, write_raster
 
 UTM = "EPSG:32632"
-LEFT, TOP = 500_100.0, 5_228_300.0
+LEFT, TOP = PLACE
 STEP, GSD, CELLS = 0.5, 0.125, 300
 DATUM = {"geoid_separation_m": 48.0, "vertical_datum": "ellipsoidal"}
 
@@ -31,22 +30,6 @@ def height(east, north):
     x, y = np.asarray(east) - LEFT, TOP - np.asarray(north)
     hills = 400 + 8 * np.sin(x / 30) + 5 * np.cos(y / 20)
     return hills + 12.0 * ((x > 60) & (x < 80) & (y > 40) & (y < 70))
-
-
-def write(path, data, step, crs=UTM, **options):
-    data = data if data.ndim == 3 else data[None]
-    profile = {
-        "driver": "GTiff",
-        "width": data.shape[2],
-        "height": data.shape[1],
-        "count": data.shape[0],
-        "dtype": data.dtype,
-        "crs": crs,
-        "transform": from_origin(LEFT, TOP, step, step),
-    } | options
-    with rasterio.open(path, "w", **profile) as out:
-        out.write(data)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +43,8 @@ def rasters(tmp_path_factory):
     ortho = np.stack([np.tile(ramp, (n, 1)), np.tile(ramp[:, None], (1, n)), np.full((n, n), 60)])
     folder = tmp_path_factory.mktemp("rasters")
     return (
-        write(folder / "dsm.tif", dsm, STEP, nodata=-9999),
-        write(folder / "ortho.tif", ortho.astype(np.uint8), GSD),
+        write_raster(folder / "dsm.tif", dsm, step=STEP, nodata=-9999),
+        write_raster(folder / "ortho.tif", ortho.astype(np.uint8), step=GSD),
     )
 
 
@@ -165,10 +148,10 @@ def test_what_is_missing_is_said(rasters, build, tmp_path):
         build([dsm], **DATUM)
     with pytest.raises(MapSourceError, match="a second DSM"):
         build([dsm, dsm], **DATUM)
-    bare = write(tmp_path / "bare.tif", np.zeros((9, 9), np.float32), 1.0, crs=None)
+    bare = write_raster(tmp_path / "bare.tif", np.zeros((9, 9), np.float32), None)
     with pytest.raises(GeoreferenceError, match="CRS"):
         build([bare, ortho], **DATUM)
-    odd = write(tmp_path / "odd.tif", np.zeros((5, 9, 9), np.uint16), 1.0)
+    odd = write_raster(tmp_path / "odd.tif", np.zeros((5, 9, 9), np.uint16))
     with pytest.raises(MapSourceError, match="neither a DSM"):
         build([odd, ortho], **DATUM)
 

@@ -7,8 +7,6 @@ from datetime import date
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter
 
 from localizer.map.building.build import build_cache
@@ -16,9 +14,9 @@ from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import MANIFEST_NAME, TileCache
 from localizer.map.inspection.kind import map_kind
 from localizer.map.kind import MapKind
+from tests.localizer.map.conftest import write_raster
 
 STEP_M, TEXEL_M, SIDE_M = 1.0, 0.25, 200.0
-LEFT, TOP = 500_100.0, 5_228_300.0
 
 
 def natural(blur_px: float) -> np.ndarray:
@@ -51,22 +49,10 @@ def houses(heights: np.ndarray) -> np.ndarray:
     return built
 
 
-def write(path, data, step, **tags):
-    data = np.atleast_3d(data)
-    profile = {
-        "driver": "GTiff", "width": data.shape[1], "height": data.shape[0], "count": data.shape[2],
-        "dtype": data.dtype, "crs": "EPSG:32632", "transform": from_origin(LEFT, TOP, step, step),
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as out:
-        out.write(np.moveaxis(data, 2, 0))
-        out.update_tags(**tags)
-    return path
-
-
 def built(folder, surface, blur_px=0.0, tags=(), **options) -> TileCache:
     sources = (
-        write(folder / "dsm.tif", surface.astype(np.float32), STEP_M),
-        write(folder / "ortho.tif", natural(blur_px), TEXEL_M, **dict(tags)),
+        write_raster(folder / "dsm.tif", surface.astype(np.float32)),
+        write_raster(folder / "ortho.tif", natural(blur_px), step=TEXEL_M, tags=dict(tags)),
     )
     how = BuildOptions(workers=1, vertical_datum="ellipsoidal", **options)
     build_cache(sources, folder / "cache", how)
