@@ -184,11 +184,17 @@ class JNGO:
     ) -> _Swarm:
         c = self.config
         R, t, drawn = _beginning(self.backend, c, problems[0], origin, prior, seed)
+        # Shadows of another hour shift the coarsest level's optimum by up to 20 px of the image.
+        starts = (R[:0], t[:0]) if drawn.any() else (R, t)
         keep = (*c.survivors[: len(problems) - 1], c.hypotheses)
         evaluations = 0
         for level, iterations, survivors, anchors in zip(
             problems, c.iterations, keep, c.swarm_anchors, strict=True
         ):
+            if level is not problems[0]:
+                R, t = np.concatenate([R, starts[0]]), np.concatenate([t, starts[1]])
+                drawn = np.concatenate([drawn, np.zeros(len(starts[0]), bool)])
+                starts = R[:0], t[:0]
             problem = self._constrained(subsample_anchors(level, anchors), constraint, R, t, origin)
             found = self.backend.refine(problem, R, t, iterations, c.settings)
             evaluations += found.evaluations

@@ -76,6 +76,7 @@ struct SelectArguments {
     double distinct;   // px
     double least_score;
     int wanted, keep;
+    int joining, unused;  // joining: the poses behind the last of from follow the survivors
 };
 
 struct PriorWeightArguments {

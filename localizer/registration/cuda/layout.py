@@ -89,6 +89,8 @@ SELECT = _structure(
     ("least_score", np.float64),
     ("wanted", np.int32),
     ("keep", np.int32),
+    ("joining", np.int32),
+    ("unused", np.int32),
 )
 PRIOR_WEIGHT = _structure(
     ("prior", _POINTER),

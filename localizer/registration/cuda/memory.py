@@ -46,8 +46,8 @@ class FrameMemory:
         survivors: int,
         anchors: int,
     ) -> FrameMemory:
-        """The layout for numbers of levels, hypotheses, survivors and anchors. buffer: returns
-        device memory by name and size.
+        """The layout for numbers of levels, hypotheses (the start poses twice), survivors and
+        anchors. buffer: returns device memory by name and size.
         """
         sizes = [
             ("level", layout.LEVEL.itemsize * levels),

@@ -41,7 +41,8 @@ __device__ inline double motion_distance(const Motion& motion, const double* R, 
 }
 
 // Orders the hypotheses by total cost (equation 10) and keeps the best distinct ones: of two whose
-// probe anchors project closer than `distinct` (rms) the better one. Survivors go to `to`.
+// probe anchors project closer than `distinct` (rms) the better one. Survivors go to `to`; if
+// `joining`, as many poses as were ranked follow them, which lie behind those.
 extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const SelectArguments a) {
     __shared__ double slots[8];
     __shared__ int kept, finite;
@@ -114,7 +115,12 @@ extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const Select
         atomicAdd(&kept, 1);
     }
     __syncthreads();
-    if (first == 0) a.state->count = kept;
+    const int joining = a.joining && kept > 0 ? count : 0;
+    for (int i = first; i < 9 * joining; i += stride)
+        a.to.rotations[9 * kept + i] = a.from.rotations[9 * count + i];
+    for (int i = first; i < 3 * joining; i += stride)
+        a.to.translations[3 * kept + i] = a.from.translations[3 * count + i];
+    if (first == 0) a.state->count = kept + joining;
 }
 
 // Equation 15's weight in units of the level's best score; nothing where no hypothesis has one.

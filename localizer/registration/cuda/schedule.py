@@ -39,6 +39,7 @@ from localizer.registration.cuda.steps import (
     COVARIANCE_ANCHORS,
     KERNELS,
     GraphShape,
+    largest_counts,
     launches,
     refine_launch,
 )
@@ -175,7 +176,7 @@ class CudaSchedule:
         finish = _taking_part(anchors, COVARIANCE_ANCHORS)
         finish = max(finish, _taking_part(anchors, config.swarm_anchors[-1]))
         return FrameMemory.of(
-            self._backend.arena.buffer, levels, count, _survivors(config, count), finish
+            self._backend.arena.buffer, levels, 2 * count, largest_counts(config, count)[-1], finish
         )
 
     def _upload(  # noqa: PLR0913
@@ -206,8 +207,9 @@ class CudaSchedule:
         state["count"] = len(swarm[0])
         memory.write(frame, memory.state, state)
         first = memory.swarms[0]
-        memory.write(frame, int(first["rotations"]), np.ascontiguousarray(swarm[0]))
-        memory.write(frame, int(first["translations"]), np.ascontiguousarray(swarm[1]))
+        # Twice: the second copy is not refined on the first level, and joins the second.
+        memory.write(frame, int(first["rotations"]), np.concatenate([swarm[0]] * 2))
+        memory.write(frame, int(first["translations"]), np.concatenate([swarm[1]] * 2))
         self._device.upload(memory.base, frame)
 
     def _collect(
@@ -252,11 +254,6 @@ class CudaSchedule:
         )
         finite = not int(state["not_finite"])
         return DeviceSearchResult(survivors, finite), sums, float(state["scale"])
-
-
-def _survivors(config: JNGOConfig, count: int) -> int:
-    """Largest number of hypotheses after the last level."""
-    return min([count, *config.survivors[: len(config.iterations) - 1]])
 
 
 def _taking_part(total: int, wanted: int) -> int:

@@ -61,17 +61,28 @@ def launches(
         finite["level"], finite["state"] = memory.level(k), memory.state
         blocks = _FINITE_BLOCKS_PER_MULTIPROCESSOR * multiprocessors
         yield KernelLaunch("all_finite", k, blocks, _SMALL_THREADS, finite)
-    alive, source = shape.hypotheses, 0
-    keep = (*c.survivors[: searched - 1], c.hypotheses)
-    for k in range(searched):
+    source, keep = 0, (*c.survivors[: searched - 1], c.hypotheses)
+    for k, alive in enumerate(largest_counts(c, shape.hypotheses)[:-1]):
         swarm, wanted = memory.swarms[source], c.swarm_anchors[k]
         target = 2 if k == searched - 1 else 1 - source
         if shape.constrained:
             yield from _weighing(shape, memory, k, swarm, alive, wanted)
         yield refine_launch(shape, memory, k, swarm, alive, wanted, c.settings, c.iterations[k])
         yield _selecting(shape, memory, k, source, target, keep[k])
-        alive, source = min(alive, keep[k]), target
+        source = target
     yield from _sharpening(shape, memory)
+
+
+def largest_counts(config: JNGOConfig, starts: int) -> list[int]:
+    """Largest number of hypotheses at each level and after the last. starts: start poses, which
+    join the second level again.
+    """
+    keep = (*config.survivors[: len(config.iterations) - 1], config.hypotheses)
+    counts = [starts]
+    for k, most in enumerate(keep):
+        joining = starts if k == 0 and len(keep) > 1 else 0
+        counts.append(min(counts[-1], most) + joining)
+    return counts
 
 
 def _sharpening(shape: GraphShape, memory: FrameMemory) -> Iterator[KernelLaunch]:
@@ -172,4 +183,5 @@ def _selecting(
     arguments["alive"], arguments["projected"] = memory.alive, memory.projected
     arguments["distinct"], arguments["least_score"] = shape.config.duplicate_px, LEAST_SCORE
     arguments["wanted"], arguments["keep"] = shape.config.swarm_anchors[level], keep
+    arguments["joining"] = level == 0 and not last
     return KernelLaunch("select_hypotheses", level, 1, _SMALL_THREADS, arguments)

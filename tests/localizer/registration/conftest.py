@@ -170,8 +170,8 @@ def scene(place: SyntheticPlace, camera: Camera) -> Scene:
 
 
 @pytest.fixture(scope="session")
-def scene_factory(place: SyntheticPlace, camera: Camera) -> Callable[[int, float, float], Scene]:
-    return lambda seed, shift_m, turn_deg: make_scene(place, camera, seed, shift_m, turn_deg)
+def scene_factory(place: SyntheticPlace, camera: Camera) -> Callable[..., Scene]:
+    return lambda seed, shift_m, turn_deg, at=place: make_scene(at, camera, seed, shift_m, turn_deg)
 
 
 @pytest.fixture(scope="session")

@@ -60,6 +60,22 @@ def test_swarm_reaches_what_one_hypothesis_does_not(scene_factory, prior):
     assert reached["single"] <= 8
 
 
+def test_a_coarsest_level_that_is_shifted_does_not_lose_a_right_start(place, scene_factory, prior):
+    """As over a park under the shadows of another hour. The finer levels capture less than the
+    coarsest level's error: every refined hypothesis is too far away for them.
+    """
+    shortest = place.waves[2] * np.array([1.5, 1.5, 1.0])
+    fine = replace(place, waves=(place.waves[0], shortest, shortest))
+    for seed in range(700, 708):
+        scene = scene_factory(seed, 0.5, 0.5, at=fine)
+        beside = replace(scene.true, translation=scene.true.translation + np.array([10.0, 0, 0]))
+        shifted = fine.pyramid(beside, scene.camera, 0.05, seed).levels[0]
+        query = replace(scene.query, levels=(shifted, *scene.query.levels[1:]))
+        about = prior(scene.reference, 0.7, 0.5)
+        result = JNGO().register(query, scene.camera, scene.anchors, about)
+        assert result.world_from_camera.distance_to(scene.true)[0] < 0.5
+
+
 def test_draws_reach_a_place_that_the_swarm_does_not(scene_factory, prior):
     """Metres beside at 110 m above ground, which the swarm's grid of angles does not stand for."""
     reached = {0: 0, 2048: 0}
