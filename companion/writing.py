@@ -32,6 +32,14 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
         raise ReportError(f"{where}: cannot be written: {error.strerror or error}") from error
 
 
+def write_result(path: Path, text: str, option: str = "") -> None:
+    """Write a file of text (UTF-8) as a whole: `ReportError` if that fails, and an old one stays.
+    option: as in `writing`.
+    """
+    with writing(path, option):
+        replace_file(path, text, _BY_UMASK)
+
+
 def make_folder(path: Path, option: str = "") -> Path:
     """Create the folder and its parents if missing, and return it; `ReportError` if that fails or
     `path` is a file. option: as in `writing`.

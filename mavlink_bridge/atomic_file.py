@@ -13,7 +13,8 @@ PRIVATE = 0o600
 
 
 def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = False) -> None:
-    """Write the text beside the file and rename it; raises `OSError` if the disk refuses.
+    """Write the text beside the file and rename it. If the disk refuses, it raises `OSError`, and
+    the old file stays.
 
     The temporary file is always a new one, so a symbolic link of another user is not followed.
     durable: the text is on the disk before the file is renamed, so that it survives a power loss.
@@ -21,14 +22,17 @@ def replace_file(path: Path, text: str, mode: int = PRIVATE, *, durable: bool = 
     """
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.unlink(missing_ok=True)
-    with open(
-        os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w", encoding="utf-8"
-    ) as file:
-        file.write(text)
-        if durable:
-            file.flush()
-            os.fsync(file.fileno())
-    temporary.replace(path)
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    try:
+        with open(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)  # its part of the text takes room of a full disk
+        raise
 
 
 def read_small_file(path: Path, most: int = 1000) -> str:

@@ -21,7 +21,7 @@ from companion.errors import CompanionError, ReportError
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import show_steps
-from companion.writing import result_file
+from companion.writing import result_file, write_result
 from localizer.errors import LocalizerError
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
@@ -223,7 +223,7 @@ def loop_table(
         result_file(out, "--out", (".json",), *files)
     rows = [row for file in files for row in read_rows(file)]
     if out is not None:
-        out.write_text(json.dumps(as_data(rows), indent=1, allow_nan=False), encoding="utf-8")
+        write_result(out, json.dumps(as_data(rows), indent=1, allow_nan=False), "--out")
     print(markdown(rows))
 
 

@@ -22,7 +22,7 @@ from rich.text import Text
 from companion.config import load_config
 from companion.terminal.steps import show_steps, show_work
 from companion.versions import made_by, processor
-from companion.writing import refuse_input, result_file, writing
+from companion.writing import refuse_input, result_file, write_result
 from mavlink_bridge.preflight.doctor import Diagnosis
 from mavlink_bridge.preflight.rules import DoctorFinding
 
@@ -139,8 +139,7 @@ def self_test_command(
         data = asdict(report) | {"versions": made_by()}
         if rows:
             data["bench"] = [asdict(row) for row in rows]
-        with writing(out, "--out"):
-            out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        write_result(out, json.dumps(data, indent=1) + "\n", "--out")
 
 
 def _speed_table(rows: Sequence[BenchRow], features: str) -> Table:

@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Annotated, Literal
@@ -233,7 +234,7 @@ def _write_report(
     local: LocalFrame,
 ) -> None:
     unusable = [f.name for f in frames if f.unusable]
-    report = metrics.to_dict() | {
+    report = asdict(metrics) | {
         "unusable_images": unusable, "settings": settings, "versions": made_by()
     }  # fmt: skip
     (folder / "report.json").write_text(json.dumps(report, indent=2))

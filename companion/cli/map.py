@@ -17,7 +17,7 @@ from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
-from companion.writing import result_file, writing
+from companion.writing import result_file, write_result, writing
 
 if TYPE_CHECKING:
     from localizer.map.importers.rules import ImportRules
@@ -270,8 +270,7 @@ def info(
     _print_warnings(m.warnings)
     for file, written, option in ((geojson, as_geojson, "--geojson"), (kml, as_kml, "--kml")):
         if file is not None:
-            with writing(file, option):
-                file.write_text(written(m, opened.path.name), encoding="utf-8")
+            write_result(file, written(m, opened.path.name), option)
 
 
 @app.command("verify")

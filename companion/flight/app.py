@@ -128,7 +128,8 @@ class Companion:
         health = self._parts.get(HealthMonitor)
         if health is not None:
             error = "" if feed.error is None else f": {feed.error}"
-            health.end("stopped" if self._is_stopping else f"the feed ended{error}")
+            how = "stopped" if self._is_stopping else f"the feed ended{error}"
+            health.end(how, is_failure=bool(error) and not self._is_stopping)
         return feed
 
     def stop(self) -> bool:

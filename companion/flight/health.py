@@ -128,11 +128,13 @@ class HealthMonitor:
         if self._file is not None:
             self._file.stop()
 
-    def end(self, how: str) -> None:
+    def end(self, how: str, *, is_failure: bool = False) -> None:
         """Set the reason for which the flight ends. From now on nothing is reported until `stop`,
-        whose last report states it.
+        whose last report states it. is_failure: the video failed, which is reported at once.
         """
         self._ended = how
+        if is_failure:
+            self._bridge.set_health(HealthLevel.FAILED, (alert(AlertId.VIDEO_FAILED),))
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Add an estimate, accepted or not. Never blocks."""
@@ -178,7 +180,11 @@ class HealthMonitor:
             return HealthStatus(level, (alert(of),))
         if not self._bridge.state().connected:
             return HealthStatus(HealthLevel.DEGRADED, (alert(AlertId.FC_SILENT),), is_reported=True)
-        engine = self._engine_health()
+        status = self._localization(self._engine_health())
+        return replace(status, alerts=(*status.alerts, *self._notes(feed)))
+
+    def _localization(self, engine: EngineHealth) -> HealthStatus:
+        """Health of the localization, without the notes."""
         if not self._estimates:
             waiting = _waiting_for(engine, self._search_obstacle(engine))
             return HealthStatus(HealthLevel.STARTING, (alert(waiting),))
@@ -186,14 +192,12 @@ class HealthMonitor:
         is_old = time.monotonic() - arrived > _STALE_S
         # The error of a lost position stands in health.json; this is what to act on.
         if estimate.state is TrackingState.LOST:
-            status = HealthStatus(HealthLevel.FAILED, self._lost(estimate, engine))
-        elif is_old:
+            return HealthStatus(HealthLevel.FAILED, self._lost(estimate, engine))
+        if is_old:
             failed = alert(_error(engine)) if engine.last_error else None
             news = failed or self._overload(engine) or alert(AlertId.NO_FRAME)
-            status = HealthStatus(HealthLevel.DEGRADED, (news,))
-        else:
-            status = self._tracking(estimate, engine)
-        return status if is_old else replace(status, alerts=(*status.alerts, *self._notes(feed)))
+            return HealthStatus(HealthLevel.DEGRADED, (news,))
+        return self._tracking(estimate, engine)
 
     def _tracking(self, estimate: PoseEstimate, engine: EngineHealth) -> HealthStatus:
         """Health while frames are processed and the position is not lost."""
@@ -317,7 +321,7 @@ def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
 
 
 def _error(engine: EngineHealth) -> AlertId:
-    return AlertId.MAP_LOADING if engine.map_loading else AlertId.LOCALIZATION_FAILED
+    return AlertId.NO_MAP_IN_VIEW if engine.no_map_in_view else AlertId.LOCALIZATION_FAILED
 
 
 def _waiting_for(engine: EngineHealth, lacks: AlertId | None) -> AlertId:

@@ -11,7 +11,7 @@ from typing import Any
 from companion.planning.plan import MissionForecast
 from companion.planning.verdicts import LegVerdict, VisionGap
 from companion.reporting.layout import data_uri
-from companion.writing import writing
+from companion.writing import write_result
 from localizer.types import Image
 
 _CSS = """
@@ -169,9 +169,8 @@ def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], pat
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Forecast</title>'
         f"<style>{_CSS}</style><body>{body}</body></html>"
     )
-    with writing(path):
-        # A file's name may hold half a character (a lone surrogate).
-        path.write_bytes(text.encode("utf-8", "replace"))
+    # A file's name may hold half a character (a lone surrogate).
+    write_result(path, text.encode("utf-8", "replace").decode("utf-8"))
 
 
 def _part(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -13,7 +13,7 @@ from companion.config import CompanionConfig
 from companion.errors import ConfigError, ReportError
 from companion.preflight.map_pin import map_hash
 from companion.versions import versions
-from companion.writing import writing
+from companion.writing import write_result
 from localizer.errors import LocalizerError
 from localizer.geometry.antimeridian import geo_box
 from localizer.map.cache.cache import TileCache
@@ -184,9 +184,8 @@ def write_sheet(sheet: PreflightSheet, path: Path) -> tuple[Path, Path]:
     paths. `ReportError` if that fails.
     """
     text_path = path.with_suffix(".txt")
-    with writing(path, "--page"):
-        path.write_text(as_html(sheet), encoding="utf-8")
-        text_path.write_text(as_text(sheet), encoding="utf-8")
+    write_result(path, as_html(sheet), "--page")
+    write_result(text_path, as_text(sheet), "--page")
     return path, text_path
 
 

@@ -25,7 +25,7 @@ from companion.reporting.content import (
     Stanford,
 )
 from companion.vendored import licence_of, vendored
-from companion.writing import writing
+from companion.writing import write_result
 from localizer.types import Image
 
 _JPEG_QUALITY = 82
@@ -40,8 +40,7 @@ _COLOURS = {
 
 def write_report(report: Report, path: Path) -> Path:
     """Write the page into an existing folder and return `path`; `ReportError` if that fails."""
-    with writing(path):
-        path.write_text(render(report), encoding="utf-8")
+    write_result(path, render(report))
     return path
 
 

@@ -7,7 +7,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
-from localizer.errors import LocalizerError, MapLoadingError
+from localizer.errors import LocalizerError, OutsideMapError
 from localizer.tracking.attitude_bias import AttitudeBias
 
 _log = logging.getLogger(__name__)
@@ -17,10 +17,10 @@ _REPORT_EVERY_S = 5.0
 @dataclass(frozen=True)
 class EngineHealth:
     """Counters since the start, text of the present error ("" without one), and names of renderer,
-    features and optimizer. map_loading: whether the error is that tiles are being read. searches,
-    found: numbers of searches and results; searching: whether one is running; search_hangs: whether
-    it no longer responds. horizon_off_deg: attitude bias in pitch and roll, and the sigma after
-    correction; None if not used.
+    features and optimizer. no_map_in_view: whether the error is an `OutsideMapError` only.
+    searches, found: numbers of searches and results; searching: whether one is running;
+    search_hangs: whether it no longer responds. horizon_off_deg: attitude bias in pitch and roll,
+    and the sigma after correction; None if not used.
     """
 
     frames_in: int = 0
@@ -34,7 +34,7 @@ class EngineHealth:
     searching: bool = False
     search_hangs: bool = False
     last_error: str = ""
-    map_loading: bool = False
+    no_map_in_view: bool = False
     renderer: str = ""
     features: str = ""
     optimizer: str = ""
@@ -47,7 +47,7 @@ class HealthCounters:
     def __init__(self, renderer: str, features: str) -> None:
         self._health = EngineHealth(renderer=renderer, features=features)
         self._errors: dict[str, Exception] = {}  # by thread
-        self._reported_s = -_REPORT_EVERY_S
+        self._reported_s: dict[type[Exception], float] = {}
         self._lock = threading.Lock()
 
     def read(
@@ -55,14 +55,14 @@ class HealthCounters:
     ) -> EngineHealth:
         """A snapshot, with values that only the engine has. bias: None: not estimated."""
         with self._lock:
-            error = next(iter(self._errors.values()), None)
+            error = min(self._errors.values(), key=_is_outside, default=None)
             return replace(
                 self._health,
                 frames_dropped=frames_dropped,
                 optimizer=optimizer,
                 horizon_off_deg=None if bias is None else bias.reported_deg,
                 last_error="" if error is None else _text(error),
-                map_loading=isinstance(error, MapLoadingError),
+                no_map_in_view=error is not None and _is_outside(error),
             )
 
     def count(self, **increments: int) -> None:
@@ -86,20 +86,24 @@ class HealthCounters:
 
     def report(self, error: Exception) -> None:
         """Set the calling thread's error until its `clear_error`, count it, and log it, at most one
-        error in 5 s.
+        error of a kind in 5 s.
         """
         with self._lock:
             self._errors[threading.current_thread().name] = error
         self.count(errors=1)
         now = time.monotonic()
-        if now - self._reported_s > _REPORT_EVERY_S:
-            self._reported_s = now
+        if now - self._reported_s.get(type(error), -_REPORT_EVERY_S) > _REPORT_EVERY_S:
+            self._reported_s[type(error)] = now
             _log.warning("%s", _text(error))
 
     def clear_error(self) -> None:
         """The calling thread works again: clear its error, but no other thread's."""
         with self._lock:
             self._errors.pop(threading.current_thread().name, None)
+
+
+def _is_outside(error: Exception) -> bool:
+    return isinstance(error, OutsideMapError)
 
 
 def _text(error: Exception) -> str:

@@ -28,7 +28,7 @@ from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import LocalFrame
 from localizer.integrity.probability import log_odds
 from localizer.map.kind import MapKind
-from localizer.odometry import GroundUncertainty, TerrainModel
+from localizer.odometry.ground import GroundUncertainty, TerrainModel
 from localizer.registration.anchors import apply_sweep, select_anchors
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
@@ -163,7 +163,7 @@ class Localizer:
     (`tracking.sensor_fusion`). With the displacement they confirm or refute a tentative track.
     map_frame, map_kind: the map's. terrain: ground heights outside the map; ground: uncertainty of
     the ground, that of hills by default. on_close: releases what was opened for this localizer.
-    is_loading: whether requested tiles are still loading.
+    is_loading: whether the latest view lacked tiles that were being read.
     """
 
     def __init__(  # noqa: PLR0913

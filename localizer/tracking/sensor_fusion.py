@@ -116,7 +116,8 @@ class SensorFusion:
         self, result: Registration, pose: Pose, unknown: Array, distance_m: float, time_ns: int
     ) -> None:
         """Update attitude bias and height error with an accepted frame, if it shows new ground.
-        Does nothing if the attitude is not used.
+        Without `LocalizerConfig.attitude` (never in flight) nothing is learned: the height error
+        stays that of the map's kind.
 
         result: its registration before `fuse`; pose: the accepted pose; unknown: (6, 6) covariance
         of the errors of map and camera model; distance_m: to the ground in view.

@@ -54,8 +54,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "frames are received, but none was processed for 2 s, without an error; not after "
               "`lost`", WHILE, _NO_FIX, f"{_TAKE_OVER}; after landing read the log"),
     condition(A.LOCALIZATION_FAILED, WARNING, "localization failed, see the log", {},
-              "no frame was processed for 2 s, or none yet, because of an error", WHILE, _NO_FIX,
-              f"{_TAKE_OVER}; land and read the log"),
+              "no frame was processed for 2 s, or none yet, with an error other than "
+              "`no_map_in_view`", WHILE, _NO_FIX, f"{_TAKE_OVER}; land and read the log"),
     condition(A.OVERLOADED, WARNING, "overloaded, {done:.0f} of {offered:.0f} frames/s",
               {"done": "Hz", "offered": "Hz"},
               "over 5 s fewer than 3 frames/s are processed, and 6 or more received", WHILE,
@@ -77,9 +77,10 @@ HEALTH: tuple[AlertSpec, ...] = (
     condition(A.SEARCHING, INFO, "searching the map", {},
               "no position is known since the start", "the first frame is processed", _NO_FIX,
               "give the position"),
-    condition(A.MAP_LOADING, INFO, "map being loaded", {},
-              "no frame was processed for 2 s, or none yet, because map tiles are read",
-              WHILE, _NO_FIX, _TAKE_OVER),
+    condition(A.NO_MAP_IN_VIEW, NOTICE, "no map in view", {},
+              "no frame was processed for 2 s, or none yet: map tiles are being read, or the "
+              "camera is too near the ground (take-off) or looks past the map", WHILE, _NO_FIX,
+              "in flight take over; check the camera's mount and the map's extent"),
     condition(A.WAITING_FOR_PRIOR, INFO, "waiting for attitude and height", {},
               "no position is known, and the autopilot's attitude or altitude or the gimbal's "
               "angles are missing", WHILE, f"{_NO_FIX}; the map cannot be searched",
@@ -88,7 +89,7 @@ HEALTH: tuple[AlertSpec, ...] = (
               "a frame is received, or after 3 s (`video_stalled`)", _NO_FIX, _VIDEO),
     condition(A.VIDEO_FAILED, ERROR, "video feed failed", {},
               "a file is damaged, or the first frames' size or format cannot be used",
-              "the program ends at once; mostly only `ending` is sent", _NO_FIX,
+              "the program ends at once (`ending`)", _NO_FIX,
               f"{_TAKE_OVER}; read the log, check the camera's settings"),
     condition(A.VIDEO_SIZE, ERROR, "video size does not fit the calibration", {},
               "frames change to another aspect ratio than `camera.model`", WHILE,
@@ -101,7 +102,7 @@ HEALTH: tuple[AlertSpec, ...] = (
               "the camera model is scaled; fixes are wrong if the camera crops", _RESOLUTION),
     condition(A.MAP_UNREADABLE, WARNING, "map unreadable", {}, "map tiles cannot be read from disk",
               "all of them have been read; no text",
-              "coarser tiles replace them: fixes are less accurate", _DISK),
+              "coarser tiles replace them: fixes are less accurate, or none", _DISK),
     condition(A.RECORD_INCOMPLETE, WARNING, "record incomplete", {},
               "a write to the record failed, or its disk was missing at a restart", "a restart",
               "recording goes on if the disk allows it", _DISK),

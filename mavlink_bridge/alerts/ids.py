@@ -119,7 +119,7 @@ class AlertId(str, enum.Enum):
     NO_SEARCH = "no_search"
     SEARCH_HANGS = "search_hangs"
     SEARCHING = "searching"
-    MAP_LOADING = "map_loading"
+    NO_MAP_IN_VIEW = "no_map_in_view"
     WAITING_FOR_PRIOR = "waiting_for_prior"
     WAITING_FOR_VIDEO = "waiting_for_video"
     VIDEO_FAILED = "video_failed"

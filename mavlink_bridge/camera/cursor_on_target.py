@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.clock import SteadyUtc
-from mavlink_bridge.link.transport import Endpoint, UdpTransport
+from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
 from mavlink_bridge.messages import CameraView, TargetReport
 from mavlink_bridge.vehicle.origin import north_east
 
@@ -40,13 +40,15 @@ class CursorOnTarget:
         self._config = config
         self._camera = camera
         self._utc = utc
-        where = Endpoint.parse(f"udpout:{config.cot_endpoint}")
-        self._socket = UdpTransport(None, (where.address, where.number))
+        self._endpoint = Endpoint.parse(f"udpout:{config.cot_endpoint}")
+        self._socket: Transport | None = None  # opened, and its name resolved, by the first event
         self._lock = threading.Lock()
         self._next_ns = 0
 
     def send(self, target: TargetReport) -> None:
-        """Send a target's event, or lose it. May block to resolve a name in `cot_endpoint`."""
+        """Send a target's event, or lose it. May block to resolve a name in `cot_endpoint`, at
+        first and after an error.
+        """
         self._write(cursor_on_target(target, self._config, self._utc))
 
     def report_view(self, view: CameraView) -> None:
@@ -60,14 +62,19 @@ class CursorOnTarget:
         self._write(aircraft_on_map(view, self._config, self._camera, self._utc))
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
+        """Close the socket. Never blocks."""
+        if self._socket is not None:
+            self._socket.close()
 
     def _write(self, event: bytes) -> None:
-        try:
-            self._socket.write(event)
-        except OSError as error:
-            _log.debug("Cursor-on-Target not sent: %s", error)
+        with self._lock:
+            try:
+                self._socket = self._socket or open_transport(self._endpoint)
+                self._socket.write(event)
+            except OSError as error:
+                _log.debug("Cursor-on-Target not sent: %s", error)
+                self.close()
+                self._socket = None
 
 
 def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc) -> bytes:

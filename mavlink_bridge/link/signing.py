@@ -5,12 +5,14 @@ https://mavlink.io/en/guide/message_signing.html
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import time
 from pathlib import Path
 from typing import Any
 
+from mavlink_bridge.atomic_file import replace_file
 from mavlink_bridge.errors import SigningKeyError
 
 _SIGNING_EPOCH_S = 1420070400  # 2015-01-01 UTC
@@ -46,11 +48,13 @@ def load_key(path: Path) -> bytes:
 
 
 def create_key(path: Path) -> bytes:
-    """Write a new random key to a new file of mode 0600 and return it; OSError if it exists."""
+    """Write a new random key to a new file of mode 0600 and return it; OSError if it exists, or
+    cannot be written: then there is none.
+    """
+    if path.exists():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     key = os.urandom(32)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(key.hex() + "\n")
+    replace_file(path, key.hex() + "\n", durable=True)
     return key
 
 

@@ -17,6 +17,7 @@ from companion.errors import ReportError
 from companion.offline.tables import Columns, read_columns
 from companion.reporting.verdicts import advice, value_and_limit
 from companion.versions import made_by
+from companion.writing import write_result
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
 from localizer.geometry.pose import Array
@@ -227,7 +228,7 @@ def _write_json(
         "config": config.model_dump(mode="json"),
         "texts": list(record.texts),
     }
-    (folder / "report.json").write_text(json.dumps(document, indent=1, default=float))
+    write_result(folder / "report.json", json.dumps(document, indent=1, default=float))
 
 
 def _write_frames(path: Path, errors: FrameErrors) -> None:

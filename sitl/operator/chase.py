@@ -15,6 +15,7 @@ from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.synth.tiles.props import CAR_COLOURS, CAR_LENGTH_M, car_mesh
 from localizer.synth.world import WorldInfo
 from sitl.camera.movers import Mover, round_trip
+from sitl.errors import SimulationError
 
 CAR = "followed car"
 SPEED_MPS = 6.0
@@ -57,7 +58,7 @@ def make_chase(
     world: WorldInfo, frame: LocalFrame, epoch_ns: int, lead_s: float, seed: int = 0
 ) -> Chase:
     """Choose the road nearest to home that is long enough. frame: the map's ENU. The car reaches
-    its begin_m lead_s after epoch_ns. Raises `ValueError` if no road is long enough.
+    its begin_m lead_s after epoch_ns. Raises `SimulationError` if no road is long enough.
     """
     needed = _ROOFS_AFTER_S[-1] * SPEED_MPS + 0.5 * _roof_length() + _AHEAD_M
     frame_from_world = frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
@@ -75,7 +76,7 @@ def make_chase(
             if best is None or away < best[0]:
                 best = (away, path, float(start))
     if best is None:
-        raise ValueError(f"no road of {needed:.0f} m in this world")
+        raise SimulationError(f"no road of {needed:.0f} m in this world")
     _, path, start = best
     rng = np.random.default_rng([seed, 97])
     mesh = car_mesh(CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))], seed=seed)

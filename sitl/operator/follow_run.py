@@ -12,6 +12,7 @@ import numpy as np
 
 from companion.offline.tables import read_columns
 from companion.targets.detections import clicked_name
+from companion.writing import write_result
 from sitl.demo.budget import draw_errors
 from sitl.errors import SimulationError
 from sitl.operator.followed import FollowedFix, FollowVerdict, follow_verdict
@@ -74,7 +75,7 @@ def fly_follows(options: RunOptions, world: int) -> tuple[FollowRow, ...]:
         options.say(f"following a car on {kind}, world {world}, draw {draw}")
         rows.append(_flown(kind, draw, options, world))
         text = json.dumps([asdict(row) for row in rows], indent=1, default=str)
-        (options.out / "follow.json").write_text(text, encoding="utf-8")
+        write_result(options.out / "follow.json", text)
         options.say(line_of(rows[-1]))
     return tuple(rows)
 

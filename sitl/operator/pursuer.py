@@ -90,26 +90,28 @@ class Pursuer:
             thread.join()
 
     def _run(self, context: ParticipantContext) -> None:
-        station = Station(context.vehicle.spare_endpoint, context.vehicle.check)
+        try:
+            vehicle = context.vehicle
+            with closing(Station(vehicle.spare_endpoint, vehicle.check)) as station:
+                self._follow(context, station)
+        except Exception as error:  # told by the verdict: a dead pursuer is no passed flight
+            self.failure = f"{type(error).__name__}: {error}"
+
+    def _follow(self, context: ParticipantContext, station: Station) -> None:
         chase = self.chase
         assert chase is not None
         begin_ns = chase.begins_ns()
         self.end_ns = begin_ns + round(FOLLOWED_S * 1e9)
-        try:
-            if time.monotonic_ns() > begin_ns:
-                raise RuntimeError("the car had gone by before the aircraft was ready")
-            with closing(_FrameLog(context.frames)) as pictures:
-                if self._fly_along(context, station, chase, begin_ns - _STEER_NS):
-                    return
-                pictures.newest()  # what there is so far is read before it counts
-                if station.run_until(self._stop.is_set, begin_ns):
-                    return
-                self._click(station, chase, *pictures.newest())
-            self._fly_along(context, station, chase, self.end_ns)
-        except Exception as error:  # told by the verdict: a dead pursuer is no passed flight
-            self.failure = f"{type(error).__name__}: {error}"
-        finally:
-            station.close()
+        if time.monotonic_ns() > begin_ns:
+            raise RuntimeError("the car had gone by before the aircraft was ready")
+        with closing(_FrameLog(context.frames)) as pictures:
+            if self._fly_along(context, station, chase, begin_ns - _STEER_NS):
+                return
+            pictures.newest()  # what there is so far is read before it counts
+            if station.run_until(self._stop.is_set, begin_ns):
+                return
+            self._click(station, chase, *pictures.newest())
+        self._fly_along(context, station, chase, self.end_ns)
 
     def _fly_along(
         self, context: ParticipantContext, station: Station, chase: Chase, until_ns: int

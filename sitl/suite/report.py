@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from companion.writing import write_result
 from sitl.suite.runner import ReportRow
 
 _COLOURS = {"pass": "green", "better": "cyan", "FAIL": "red", "ERROR": "red"}
@@ -48,9 +49,9 @@ def summary(rows: Iterable[ReportRow]) -> str:
 def write_report(rows: Sequence[ReportRow], folder: Path) -> None:
     """Write suite.md and suite.json into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "suite.md").write_text(markdown(rows), encoding="utf-8")
+    write_result(folder / "suite.md", markdown(rows))
     text = json.dumps([_as_data(row) for row in rows], indent=1)
-    (folder / "suite.json").write_text(text + "\n", encoding="utf-8")
+    write_result(folder / "suite.json", text + "\n")
 
 
 def markdown(rows: Sequence[ReportRow]) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import re
+import resource
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,9 +20,11 @@ from companion.errors import FootageError, ReportError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from companion.recorded.autopilot_log import read_autopilot_log
 from companion.redaction import redacted
+from companion.reporting.content import Report
+from companion.reporting.layout import write_report
 from companion.sources import SourceSettings, StreamState, open_source
 from companion.targets.detections import Detection, parse_detection
-from companion.writing import refuse_input, result_file
+from companion.writing import refuse_input, result_file, write_result
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.evaluation.sequences import CSV_COLUMNS
 from localizer.geometry.camera import Camera
@@ -44,6 +47,22 @@ def test_a_result_is_no_input_has_its_suffix_and_lies_beside_a_cache(tmp_path):
         result_file(cache / "manifest.json", "--geojson", (".geojson", ".json"))
     assert result_file(tmp_path / "new.json", "--json", (".json",), given, None)
     refuse_input(tmp_path / "new.json", "--out", given)
+
+
+def test_a_full_disk_leaves_the_old_report(tmp_path):
+    """`report --overwrite` had emptied it before the first byte was refused."""
+    path = tmp_path / "report.html"
+    path.write_text("old")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))  # each write fails
+    try:
+        with pytest.raises(ReportError, match=r"--out .*report\.html: cannot be written"):
+            write_result(path, "new", "--out")
+        with pytest.raises(ReportError, match=r"report\.html: cannot be written"):
+            write_report(Report("", "", ""), path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("report.html", "old")]
 
 
 def test_localize_keeps_its_priors(small_assets, small_sequence, tmp_path):

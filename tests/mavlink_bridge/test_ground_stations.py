@@ -4,6 +4,7 @@ import contextlib
 import json
 import math
 import socket
+import threading
 from itertools import count
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from mavlink_bridge.camera.messages import camera_information, video_stream_info
 from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.link.transport import UdpTransport
 
 SECOND = 10**9
 ROOT = Path(__file__).parents[2]
@@ -111,6 +113,46 @@ def test_the_aircraft_is_sent_once_a_second_and_only_where_it_is_wanted():
             cot.close()
             got = [etree.fromstring(listener.recv(65536)).get("uid") for _ in range(expected + 1)]
             assert got == ["pilot-aircraft-UAS 7"] * expected + ["pilot-target-3"]
+
+
+def test_the_ground_stations_name_is_resolved_again_only_after_an_error(monkeypatch):
+    """Each event asked the name server, on the thread that sends the targets."""
+    asked, sent = [], []
+    monkeypatch.setattr(socket, "gethostbyname", lambda name: asked.append(name) or "127.0.0.1")
+
+    def send(transport, data):
+        sent.append(data)
+        if len(sent) == 2:
+            raise OSError("network is unreachable")
+        return len(data)
+
+    monkeypatch.setattr(UdpTransport, "write", send)
+    cot = CursorOnTarget(COT.model_copy(update={"cot_endpoint": "station:9"}), CAMERA, UTC)
+    for _ in range(4):
+        cot.send(TargetReport(SECOND, 47.0, 8.0, 450.0, target_id=3))
+    cot.close()
+    assert asked == ["station"] * 2
+    assert len(sent) == 4
+
+
+def test_closing_does_not_wait_for_a_name_server(monkeypatch):
+    """It would keep the bridge from ending, and the record after it."""
+    asked, closed, order = threading.Event(), threading.Event(), []
+
+    def resolve(_name):
+        asked.set()
+        order.append("closed" if closed.wait(5.0) else "gave up")
+        raise OSError("no answer")
+
+    monkeypatch.setattr(socket, "gethostbyname", resolve)
+    cot = CursorOnTarget(COT.model_copy(update={"cot_endpoint": "station:9"}), CAMERA, UTC)
+    sender = threading.Thread(target=cot.send, args=(TargetReport(SECOND, 47.0, 8.0, 450.0),))
+    sender.start()
+    assert asked.wait(30.0)
+    cot.close()
+    closed.set()
+    sender.join()
+    assert order == ["closed"]
 
 
 def _marks(reports, **targets):

@@ -16,7 +16,7 @@ from companion.cli.before.shared_options import Record, RecordMap, RecordTlog
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count
-from companion.writing import result_file, writing
+from companion.writing import result_file, write_result
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -70,9 +70,8 @@ def flight_command(
     )  # fmt: skip
     console.print(_changes(wanted))
     if report is not None:
-        with writing(report, "--json"):
-            text = json.dumps(_figures(found, wanted, blind), indent=1)
-            report.write_text(text, encoding="utf-8")
+        text = json.dumps(_figures(found, wanted, blind), indent=1)
+        write_result(report, text, "--json")
     if write and config is not None:
         require_flown_with(config, wanted)
         kept = write_changed(config, wanted, f"calibrated by `companion calibrate flight {record}`")

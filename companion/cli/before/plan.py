@@ -16,7 +16,7 @@ from rich.table import Table
 
 from companion.config import load_config
 from companion.terminal.steps import show_count, show_work
-from companion.writing import make_folder, writing
+from companion.writing import make_folder, write_result, writing
 
 
 def plan_command(
@@ -91,7 +91,7 @@ def plan_command(
         for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
             write_rgb(out / name, rgb)
         page.write_page(plan, shown, out / "plan.html")
-        (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+        write_result(out / "plan.json", json.dumps(document, indent=1))
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
     _print("without vision", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
     _print("alternatives", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))

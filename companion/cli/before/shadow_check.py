@@ -18,7 +18,7 @@ from rich.table import Table
 
 from companion.cli.before.shared_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.steps import COMPILES, show_count
-from companion.writing import result_file, writing
+from companion.writing import result_file, write_result
 
 if TYPE_CHECKING:
     from companion.config import CompanionConfig
@@ -75,9 +75,8 @@ def shadow_check_command(
                 flight, video, deployment, rate_hz, lambda s, total: count(round(s), round(total))
             )
     if report is not None:
-        with writing(report, "--json"):
-            text = json.dumps(asdict(found) | {"go": found.go}, indent=1)
-            report.write_text(text, encoding="utf-8")
+        text = json.dumps(asdict(found) | {"go": found.go}, indent=1)
+        write_result(report, text, "--json")
     _show(found)
     raise typer.Exit(0 if found.go else 1)
 

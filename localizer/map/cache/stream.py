@@ -2,7 +2,8 @@
 
 `select` does not wait for the disk unless told to. Resident parents replace missing detail. One
 thread loads tiles (decoding releases the GIL); least recently used nodes are evicted when the byte
-budget is full.
+budget is full. `TileStreamer.lacks_tiles`: whether the latest selection lacked tiles that were to
+be read; they may be in memory by now.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class TileStreamer:
         self._arrived_bytes = 0
         self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
-        self._closed = self._waiting = False
+        self._closed = self._waiting = self.lacks_tiles = False
         self._hold = _held(cache)
         self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
         self._thread.start()
@@ -193,6 +194,7 @@ class TileStreamer:
         choice = self._selector.select(world_from_camera, camera, self._nodes.resident, limits)
         self._protected = {0, *choice.wanted.tolist(), *choice.shown.tolist()}
         self._queue = [n for n in choice.requests.tolist() if not self._failed.is_waiting(n)]
+        self.lacks_tiles = bool(self._queue)
         self._lock.notify_all()
         return choice
 
@@ -222,9 +224,8 @@ class TileStreamer:
                     continue
                 node = nodes.pop(0)
                 # A node may have been asked for again while it was being loaded.
-                if self._failed.is_waiting(node) or self._nodes.resident[node]:
-                    continue
-                if any(node == arrived for arrived, _ in self._arrived):
+                has_arrived = any(node == arrived for arrived, _ in self._arrived)
+                if has_arrived or self._failed.is_waiting(node) or self._nodes.resident[node]:
                     continue
             loaded = _load(self.cache, node)
             with self._lock:
@@ -266,10 +267,8 @@ def _held(cache: TileCache) -> CacheLock:
 
 
 def _load(cache: TileCache, node: int) -> list[TileMesh] | MapCacheError:
-    start = int(cache.index.tile_start[node])
     try:
-        tiles = range(start, start + int(cache.index.tile_count[node]))
-        return [_ready(cache.load_tile(t)) for t in tiles]
+        return [_ready(cache.load_tile(t)) for t in cache.index.tiles_of(node)]
     except MapCacheError as error:
         return error
     except Exception as error:  # or nothing would be loaded ever again

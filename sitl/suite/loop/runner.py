@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 
-from mavlink_bridge.atomic_file import replace_file
+from companion.writing import write_result
 from sitl.demo.assets import prepare
 from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
@@ -22,7 +22,6 @@ from sitl.vehicles.process import VehicleKind
 
 _MOST_SEEDS = 1000
 _DIGITS = 9
-_READABLE = 0o644
 _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown world's seed
 
 
@@ -65,8 +64,8 @@ def fly_loop(
         rows.append(row)
         landed(row)
         report = json.dumps(as_data(rows), indent=1, allow_nan=False)
-        replace_file(kept, report, _READABLE)
-        (options.out / "loop.md").write_text(markdown(rows), encoding="utf-8")
+        write_result(kept, report)
+        write_result(options.out / "loop.md", markdown(rows))
     return tuple(rows)
 
 
@@ -111,7 +110,7 @@ def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: RunOptions) ->
         why = f"{type(error).__name__}: {error}"
         return LoopRow(case.name, kind, seed, (), error=why)
     text = json.dumps(asdict(record), indent=1, default=str)
-    (folder / "flight.json").write_text(text, encoding="utf-8")
+    write_result(folder / "flight.json", text)
     return LoopRow(
         case.name,
         kind,

@@ -9,6 +9,7 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from companion.flight.app import Companion
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Component
 from companion.flight.feed import Feed
+from companion.flight.health import HealthMonitor
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.bridge import Bridge
@@ -169,7 +171,8 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
         if fails == "start":
             raise OSError("no more threads")
 
-    memory, feed = _Memory(), _StubFeed()
+    memory, feed, failures = _Memory(), _StubFeed(), []
+    health = SimpleNamespace(end=lambda _, is_failure: failures.append(is_failure))
     feed.ended = threading.Event()
     feed.ended.set()
     feed.error = StreamOpenError("gone") if fails == "feed" else None
@@ -178,7 +181,8 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
         stop=lambda made: made.log.append("stop"), hand_over=lambda made: made.log.append("leave"),
     )  # fmt: skip
     parts = [p for p in COMPONENTS if p.name == "map"]
-    parts += [part, Component("feed", Feed, lambda _: feed, start=fail)]
+    parts += [part, Component("health", HealthMonitor, lambda _: health)]
+    parts += [Component("feed", Feed, lambda _: feed, start=fail)]
     with (
         pytest.raises(OSError, match="no more")
         if fails == "start"
@@ -186,6 +190,7 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
     ):
         Companion(config, parts).run()
     assert memory.log == log
+    assert failures == ([] if fails == "start" else [fails == "feed"])  # a failure is alerted
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(

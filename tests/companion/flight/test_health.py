@@ -37,7 +37,7 @@ class FakeBridge:
     def state(self):
         return SimpleNamespace(connected=self._connected)
 
-    def set_health(self, level, alerts, *, tell):
+    def set_health(self, level, alerts, *, tell=True):
         known = {alert.id for alert in alerts} & {FAULT.id, FROZEN.id}  # told by bridge and monitor
         assert tell is (self._connected and not known)  # as is a silent vehicle
         self.told.append((level, *(alert.id for alert in alerts)))
@@ -104,13 +104,27 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, of):
         (EngineHealth(frames_in=3, searches=2, searching=True), AlertId.SEARCHING),
         (EngineHealth(frames_in=3, searches=2), AlertId.SEARCHING),  # between two searches
         (EngineHealth(frames_in=3, last_error="x"), AlertId.LOCALIZATION_FAILED),
-        (EngineHealth(frames_in=3, last_error="x", map_loading=True), AlertId.MAP_LOADING),
+        (EngineHealth(frames_in=3, last_error="x", no_map_in_view=True), AlertId.NO_MAP_IN_VIEW),
     ],
 )
 def test_what_is_waited_for_is_told(tmp_path, engine, of):
     """With pictures and no estimate it is the autopilot's position or attitude that is missing."""
     told, _ = _one_report(tmp_path, StreamState.LIVE, True, engine=engine)
     assert told[-1] == (HealthLevel.STARTING, of)
+
+
+def test_a_map_that_cannot_be_read_is_reported_before_the_first_fix_and_after_the_last(
+    tmp_path, monkeypatch
+):
+    """A disk that fails empties the view: `no map in view` alone is also that of each take-off."""
+    engine = EngineHealth(frames_in=3, last_error="x", no_map_in_view=True)
+    expected = (AlertId.NO_MAP_IN_VIEW, AlertId.MAP_UNREADABLE)
+    options: dict[str, Any] = {"engine": engine, "unreadable_nodes": lambda: 3}
+    told, _ = _one_report(tmp_path, StreamState.LIVE, True, **options)
+    assert told[-1] == (HealthLevel.STARTING, *expected)
+    monkeypatch.setattr("companion.flight.health._STALE_S", -1.0)
+    told, _ = _one_report(tmp_path, StreamState.LIVE, True, TrackingState.TRACKING, **options)
+    assert told[-1] == (HealthLevel.DEGRADED, *expected)
 
 
 def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
@@ -350,3 +364,16 @@ def test_its_first_turn_is_its_start_not_its_making():
     begun_ns = monitor.last_tick_ns
     monitor.stop()
     assert begun_ns - made_ns >= 36_000_000_000
+
+
+def test_a_video_that_fails_is_told_before_the_end(tmp_path):
+    """It ends the flight at once: the next second's report had only the end."""
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        EngineHealth, bridge, lambda: StreamState.CLOSED, lambda *_: None, tmp_path
+    )
+    monitor.start()
+    monitor.end("the feed ended: damaged", is_failure=True)
+    monitor.stop()
+    assert bridge.told == [(HealthLevel.FAILED, AlertId.VIDEO_FAILED)]
+    assert [alert.id for alert in bridge.said] == [AlertId.ENDING]

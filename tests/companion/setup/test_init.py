@@ -164,6 +164,7 @@ def test_a_full_disk_leaves_the_old_file_and_names_the_new_one(tmp_path, monkeyp
     assert re.match("d.yaml: cannot be written", str(done.exception))
     assert (tmp_path / "d.yaml").read_text() == "old"
     assert re.match("k.key: cannot be written", str(key.exception))
+    assert [p.name for p in tmp_path.iterdir()] == ["d.yaml"]  # no empty key, no part of a file
 
 
 def test_something_else_in_the_maps_place_is_refused(tmp_path):

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from localizer.config import LocalizerConfig
-from localizer.errors import MapLoadingError, ModelError, OutsideMapError, RenderError
+from localizer.errors import (
+    MapCacheError,
+    MapLoadingError,
+    ModelError,
+    OutsideMapError,
+    RenderError,
+)
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.registration.config import JNGOConfig
@@ -150,12 +156,22 @@ def test_a_map_that_is_being_loaded_is_told_as_that() -> None:
         localizer.make_reference(prior)
 
 
-def test_an_engine_says_that_the_map_is_loading():
+@pytest.mark.parametrize("error", [MapLoadingError, OutsideMapError])
+def test_a_view_without_map_is_no_failure_and_any_other_error_is(error):
+    """On the ground the near surfaces are cut off; the ground station was advised to land."""
     book = HealthCounters("", "")
-    book.report(MapLoadingError("the map is being loaded"))
-    assert book.read(0, "").map_loading
-    book.report(OutsideMapError("the view does not meet the map"))
-    assert not book.read(0, "").map_loading
+    book.report(error("nothing in view"))
+    assert book.read(0, "").no_map_in_view
+    book.report(MapCacheError("gone"))
+    assert not book.read(0, "").no_map_in_view
+
+
+def test_another_kind_of_error_is_logged_at_once(caplog):
+    """The log that an alert referred to had the error of 3 s before only."""
+    book = HealthCounters("", "")
+    for error in (MapLoadingError("loading"), MapLoadingError("still"), MapCacheError("gone")):
+        book.report(error)
+    assert [r.message for r in caplog.records] == ["loading", "gone"]
 
 
 # --- mailbox ------------------------------------------------------------------------------------

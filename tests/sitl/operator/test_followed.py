@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from localizer.geometry.camera import Camera
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
+from sitl.errors import SimulationError
 from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
 from sitl.operator.followed import FollowedFix, follow_verdict
+from sitl.operator.pursuer import Pursuer
 
 SECOND = 10**9
+CAMERA = Camera.from_fov(320, 240, 60.0)
 
 
 @pytest.fixture
@@ -21,6 +27,21 @@ def chase(small_assets: FlightAssets) -> Chase:
     lane = np.column_stack([np.arange(-400.0, 401.0, 10.0), np.zeros(81), np.zeros(81)])
     longer: WorldInfo = replace(world, roads=(lane,))
     return make_chase(longer, world.frame, SECOND, 5.0)
+
+
+def test_an_operator_who_cannot_begin_fails_the_flight(small_assets: FlightAssets) -> None:
+    """Without its link the thread died with a traceback, and the flight had no operator."""
+    pursuer = Pursuer(small_assets, CAMERA, 100.0, 0)
+    context: Any = SimpleNamespace(vehicle=SimpleNamespace(spare_endpoint="nonsense", check=None))
+    with pursuer.take_part(context):
+        pass
+    assert pursuer.failure
+
+
+def test_a_world_without_a_long_road_is_a_named_error(small_assets: FlightAssets) -> None:
+    world = replace(small_assets.world, roads=())
+    with pytest.raises(SimulationError, match="no road"):
+        make_chase(world, world.frame, SECOND, 5.0)
 
 
 def fixes(chase: Chase, until_s: float = 60.0, off_m: float = 0.3) -> list[FollowedFix]:

@@ -133,6 +133,15 @@ def test_a_view_larger_than_the_budget_gets_coarser(cache):
         assert footprint(meshes) == pytest.approx(400 * 400, rel=1e-4)
 
 
+def test_a_view_lacks_what_arrived_after_it_was_selected(streamer):
+    """A view was empty and the loader idle: the tiles came while it was drawn."""
+    assert streamer.select(above(0, 0, 60), CAMERA) == []
+    until(lambda: streamer.idle)
+    assert streamer.lacks_tiles
+    assert streamer.select(above(0, 0, 60), CAMERA)
+    assert not streamer.lacks_tiles
+
+
 def test_prefetch_makes_the_next_view_complete(streamer):
     here, there = above(-150, -150, 60), above(150, 150, 60)
     streamer.select(here, CAMERA, wait=True)
