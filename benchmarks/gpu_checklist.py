@@ -22,7 +22,8 @@ from pathlib import Path
 from benchmarks.common.arguments import Parser, existing, number, output
 from benchmarks.common.figures import markdown, write_figures
 from benchmarks.common.named_errors import named_errors
-from localizer.registration.cuda import CudaError, Device
+from localizer.registration.cuda.driver import Device
+from localizer.registration.cuda.errors import CudaError
 
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = "tests/localizer/registration/cuda"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -208,15 +207,6 @@ class TargetConfig(StrictModel):
         return value
 
 
-@dataclass(frozen=True)
-class PriorConfig:
-    """Assumed accuracy of the autopilot's position when tracking (re)starts from it."""
-
-    position_sigma_m: float = SENSORS.start_m
-    rotation_sigma_deg: float = SENSORS.heading_deg
-    recall_s: float = 20.0  # oldest confirmed position that a restart uses
-
-
 class RecordConfig(StrictModel):
     """What is recorded of a flight."""
 
@@ -252,7 +242,6 @@ class CompanionConfig(StrictModel):
     localizer: LocalizerConfig = LocalizerConfig()
     bridge: BridgeConfig = BridgeConfig()
     targets: TargetConfig = TargetConfig()
-    prior: PriorConfig = Field(PriorConfig(), exclude=True)
     integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
     record: RecordConfig | None = None
     state_dir: Path | None = Field(

@@ -28,8 +28,8 @@ _GAP_S = 0.3  # longer without samples the motion is unknown
 _KEPT = 1024
 
 
-class VehicleTelemetry(Protocol):
-    """The vehicle's telemetry that the monitor reads from the bridge, without impossible values."""
+class AttitudeTelemetry(Protocol):
+    """The vehicle's state and attitudes: from the bridge in flight, from a record afterwards."""
 
     def state(self) -> VehicleState:
         """Newest state of the vehicle."""
@@ -39,12 +39,16 @@ class VehicleTelemetry(Protocol):
         """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
         ...
 
-    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """IMU samples after a time, oldest first."""
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a CLOCK_MONOTONIC time; None if unknown."""
         ...
 
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time; None if unknown."""
+
+class VehicleTelemetry(AttitudeTelemetry, Protocol):
+    """The vehicle's telemetry that the monitor reads from the bridge, without impossible values."""
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """IMU samples after a time, oldest first."""
         ...
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:

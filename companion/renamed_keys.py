@@ -24,8 +24,14 @@ RENAMED = {
 }
 """Old path: new path."""
 
+_CONSTANTS = (
+    "bridge.injection.covariance", "bridge.injection.yaw_guard", "integrity_monitor.calibration",
+    "integrity_monitor.gnss_accuracy_cap_m", "integrity_monitor.gnss_repeat_s",
+    "integrity_monitor.height_m", "integrity_monitor.jump_hold_s", "integrity_monitor.jump_m",
+    "integrity_monitor.motion", "integrity_monitor.picture", "integrity_monitor.tilt_deg",
+    "integrity_monitor.unreported_jump_m", "integrity_monitor.untold_jump_m", "prior",
+)  # fmt: skip
 REMOVED = {
-    "integrity_monitor.untold_jump_m": "it is a constant of the program",
     "bridge.state_file": "state_dir is the folder of all that a restart reads",
     "bridge.signing.state_file": "state_dir is the folder of all that a restart reads",
     "bridge.ground_signing.state_file": "state_dir is the folder of all that a restart reads",
@@ -38,8 +44,9 @@ REMOVED = {
     "bridge.targets.rate_hz": "it is targets.rate_hz",
     "record.mcap": "`companion export RECORD --mcap` writes it after the flight",
     "localizer.feature_threads": "it follows from localizer.threads",
+    **dict.fromkeys(_CONSTANTS, "it is a constant of the program"),
 }
-"""Path: why it has no effect any more. Constants of the program (see above) need no entry."""
+"""Path: why it has no effect any more. Constants that are fields (see above) need no entry."""
 
 
 def with_current_keys(model: type[BaseModel], data: dict[str, Any], where: str) -> dict[str, Any]:

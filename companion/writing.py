@@ -1,12 +1,16 @@
-"""Named errors for failed writes, and non-blocking writing."""
+"""Named errors for failed writes, JSON values, and non-blocking writing."""
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from companion.errors import ReportError
 from localizer.map.cache.cache import INDEX_NAME
@@ -70,6 +74,21 @@ def refuse_input(path: Path, option: str, *inputs: Path | None) -> None:
             raise ReportError(f"{option}: would replace {given}, which is read; give another one")
     if any((folder / INDEX_NAME).is_file() for folder in path.resolve().parents):
         raise ReportError(f"{option} {path}: lies in a tile cache; give a file beside it")
+
+
+def json_value(value: Any) -> Any:
+    """As JSON's own types; NaN and infinity become None."""
+    if isinstance(value, dict):
+        return {str(k): json_value(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)
 
 
 class NewestFile:

@@ -35,12 +35,6 @@ class DeviceArray:
             other,
         )  # fmt: skip
 
-    def reshaped(self, *shape: int) -> DeviceArray:
-        """The same memory under another shape. `DeviceArrayError` if its size differs."""
-        if int(np.prod(shape)) != int(np.prod(self.shape)):
-            raise DeviceArrayError(f"a device array of shape {self.shape} cannot be {shape}")
-        return DeviceArray(self.address, shape, self.dtype, self.owner)
-
     def checked_address(self, dtype: DTypeLike) -> int:
         """The address for a kernel. `DeviceArrayError` if the array is not of `dtype` or not
         aligned to 16 bytes.

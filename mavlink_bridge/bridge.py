@@ -21,7 +21,7 @@ from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, mes
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.injection_enable import InjectionEnable
-from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
+from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import Link, LinkHandler, LinkOptions
@@ -440,7 +440,7 @@ def _enable(config: BridgeConfig, notifier: StatusNotifier) -> InjectionEnable |
     if config.mode != "rc":
         return None
     file = config.state_file
-    memory = None if file is None else InjectionEnableMemory(RestartMemory(file))
+    memory = None if file is None else InjectionEnableMemory(file)
     return InjectionEnable(config.rc, notifier.report, memory)
 
 

@@ -45,10 +45,6 @@ SYSTEM_STATUS = {
 _ORDERS = frozenset((*COMMANDS.values(), *TRACKING, *LOOKS, PLACE_HINT))
 
 
-def _is_order(command: int) -> bool:
-    return command in _ORDERS
-
-
 class Components:
     """The bridge's components on one link; its owner thread calls the methods.
 
@@ -134,7 +130,7 @@ class Components:
         """
         if link.congested:
             return
-        if _is_order(message.command) and not self._may_order(message):
+        if message.command in _ORDERS and not self._may_order(message):
             self._refuse(link, message)
             return
         localizer = self._config.localizer_component

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -36,20 +35,6 @@ class OriginConfig(StrictModel):
     latitude_deg: float = Field(ge=-90.0, le=90.0)
     longitude_deg: float = Field(ge=-180.0, le=180.0)
     altitude_amsl_m: float = Field(ge=-500.0, le=9000.0)
-
-
-@dataclass(frozen=True)
-class YawGuardConfig:
-    """Cross-check of the vision yaw against the autopilot's and the gyros'.
-
-    A vision frame rotated by 5 deg costs 25 m and raises no warning in ArduPilot.
-    """
-
-    enabled: bool = True
-    limit_deg: float = 3.5  # against the autopilot's yaw, or its gyros since earlier fixes
-    gross_deg: float = 20.0  # largest difference in any case
-    memory_s: float = 60.0  # time for which the gyros are used
-    minimum_samples: int = 5  # fixes compared: the majority blocks, all release
 
 
 class InjectionConfig(StrictModel):
@@ -94,11 +79,9 @@ class InjectionConfig(StrictModel):
     send_attitude: bool = Field(
         default=True, description="false: NaN angles in VISION_POSITION_ESTIMATE"
     )
-    covariance: Literal["profile", "cbrt", "sqrt", "variance"] = Field("profile", exclude=True)
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
     gps_velocity: bool = Field(default=True, description="GPS_INPUT holds a velocity")
     gps_yaw: bool = Field(default=False, description="GPS_INPUT holds a yaw")
-    yaw_guard: YawGuardConfig = Field(YawGuardConfig(), exclude=True)
 
     @model_validator(mode="after")
     def _rate_suits_message(self) -> InjectionConfig:

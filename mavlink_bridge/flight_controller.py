@@ -18,7 +18,7 @@ from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
 from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.outcome import InjectionOutcome
-from mavlink_bridge.injection.restart_memory import RestartMemory, ShadowFailureMemory
+from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.injection.switching import SourceOrders
 from mavlink_bridge.link.link import Link
@@ -59,9 +59,9 @@ FC_WANTED = frozenset(
 )
 
 
-def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
+def _no_go_memory(config: BridgeConfig) -> ShadowFailureMemory | None:
     file = config.state_file
-    return None if file is None else RestartMemory(file.with_name("shadow-no-go.json"))
+    return None if file is None else ShadowFailureMemory(file.with_name("shadow-no-go.json"))
 
 
 class FlightControllerEnd:
@@ -87,13 +87,13 @@ class FlightControllerEnd:
         self.outcome = InjectionOutcome(shared, self.origin, notifier, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, notifier, self.counters)
         self.sources = SourceOrders(config.switch, commander, notifier, self.counters)
-        self._no_go = no_go = _no_go_memory(config)
+        self._no_go = _no_go_memory(config)
         self._interlock = ShadowInterlock(
             config.injection.force,
             self.shadow_score,
             lambda: self.outcome.compared_ns,
             notifier,
-            None if no_go is None else ShadowFailureMemory(no_go),
+            self._no_go,
         )
         self.news = VehicleEvents(notifier)
         self._warnings = FixWarnings(shared, self.sender.injector, notifier)

@@ -16,7 +16,7 @@ from mavlink_bridge.messages import PlaceHint
 PLACE_HINT = int(mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE)
 _DEFAULT_RADIUS_M = 100.0  # where the command gives no accuracy
 _LEAST_RADIUS_M, _LARGEST_RADIUS_M = 10.0, 20_000.0
-_GLOBAL = (
+GLOBAL_FRAMES = (
     mavlink.MAV_FRAME_GLOBAL,
     mavlink.MAV_FRAME_GLOBAL_INT,
     mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
@@ -32,7 +32,7 @@ def place_hint(message: Any) -> PlaceHint | None:
     COMMAND_LONG.
     """
     if message.get_type() == "COMMAND_INT":
-        if message.frame not in _GLOBAL:  # x and y of a local frame are metres
+        if message.frame not in GLOBAL_FRAMES:  # x and y of a local frame are metres
             return None
         latitude, longitude = message.x * 1e-7, message.y * 1e-7
     else:

@@ -11,7 +11,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -23,7 +23,6 @@ from companion.terminal.links import file_link
 from companion.terminal.steps import show_steps
 from companion.writing import result_file, write_result
 from localizer.errors import LocalizerError
-from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
 from sitl.demo.flight import DemoRecord, FlightObservers, fly
@@ -31,6 +30,7 @@ from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import LogProgress, shown_progress
 from sitl.demo.report import make_report, print_report
 from sitl.demo.scenario import (
+    Condition,
     Injection,
     Scenario,
     ScenarioError,
@@ -61,11 +61,9 @@ _REPORT_FILES = (
 
 _IDEAL = "a map that shares geometry and texture with the world, a perfect camera, no errors drawn"
 _LOG_WIDTH = 200
-_SUITE_KINDS: dict[str, tuple[VehicleKind, ...]] = {
-    "embedded": ("embedded",),
-    "ardupilot": ("ardupilot",),
-    "both": ("ardupilot", "embedded"),
-}
+Vehicles = Annotated[
+    Literal["embedded", "ardupilot", "both"], typer.Option("--fc", help="simulated vehicle")
+]
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -78,15 +76,12 @@ def _group() -> None:
 @app.command()
 def demo(
     seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
-    fc: Annotated[str, typer.Option(help="auto, ardupilot or embedded")] = "auto",
+    fc: Annotated[VehicleChoice, typer.Option(help="simulated vehicle")] = "auto",
     scenario: Annotated[
         str | None, typer.Option(help="scenario YAML, or one of " + ", ".join(scenario_names()))
     ] = None,
     injection: Annotated[
-        str | None,
-        typer.Option(
-            help="MAVLink message instead of the scenario's: " + ", ".join(get_args(Injection))
-        ),
+        Injection | None, typer.Option(help="MAVLink message instead of the scenario's")
     ] = None,
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report"),
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
@@ -105,17 +100,9 @@ def demo(
     ] = None,
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
-    kinds: dict[str, VehicleChoice] = {
-        "auto": "auto", "ardupilot": "ardupilot", "embedded": "embedded"
-    }  # fmt: skip
-    if fc not in kinds:
-        raise ScenarioError(f"--fc is auto, ardupilot or embedded, not {fc!r}")
     script = named_scenario(scenario) if scenario else Scenario()
     script = script.ideal() if ideal else script
     if injection is not None:
-        if injection not in get_args(Injection):
-            known = ", ".join(get_args(Injection))
-            raise ScenarioError(f"--injection is one of {known}, not {injection!r}")
         script = Scenario.model_validate(script.model_dump() | {"injection": injection})
     console = Console()
     if map_ is not None:
@@ -135,7 +122,7 @@ def demo(
             progress, partial(_tell_endpoint, console), port, partial(_tell_page, console)
         )
         program = shlex.split(companion) if companion else THIS_PROGRAM
-        record = fly(assets, script, kinds[fc], seed, out, observers, program)
+        record = fly(assets, script, fc, seed, out, observers, program)
     _report(console, record, script, seed)
 
 
@@ -147,8 +134,7 @@ def sequence(
         str | None, typer.Option(help="scenario YAML, or one of " + ", ".join(scenario_names()))
     ] = None,
     condition: Annotated[
-        str | None,
-        typer.Option(help="light and weather instead of the scenario's: " + ", ".join(CONDITIONS)),
+        Condition | None, typer.Option(help="light and weather instead of the scenario's")
     ] = None,
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
     ideal: Annotated[bool, typer.Option("--ideal", help=_IDEAL)] = False,
@@ -157,8 +143,6 @@ def sequence(
     script = named_scenario(scenario) if scenario else Scenario()
     script = script.ideal() if ideal else script
     if condition is not None:
-        if condition not in CONDITIONS:
-            raise ScenarioError(f"--condition is one of {', '.join(CONDITIONS)}, not {condition!r}")
         script = Scenario.model_validate(script.model_dump() | {"condition": condition})
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ScenarioError(f"{out}: exists already and is not empty; give another folder")
@@ -173,7 +157,7 @@ def sequence(
 
 @app.command()
 def suite(
-    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    fc: Vehicles = "embedded",
     only: Annotated[list[str] | None, typer.Option(help="scenario name; may be repeated")] = None,
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report-suite"),
     jobs: Annotated[int | None, typer.Option(min=1, help="flights side by side")] = None,
@@ -190,7 +174,7 @@ def suite(
 
 @app.command()
 def loop(
-    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    fc: Vehicles = "embedded",
     only: Annotated[
         list[str] | None,
         typer.Option(help="flight, or `normal` for all without a fault; may be repeated"),
@@ -216,7 +200,7 @@ def loop(
 
 @app.command()
 def follow(
-    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    fc: Vehicles = "embedded",
     out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-follow"),
     seed: Annotated[int, typer.Option(min=0, max=10**6, help="of the world")] = 0,
     draws: Annotated[str, typer.Option(help="of car and errors: 5, or 5..7")] = "5..7",
@@ -244,11 +228,10 @@ def loop_table(
 
 
 def _runner(
-    fc: str, out: Path, seeds: str = "1", worlds: Path | None = None
-) -> tuple[Console, RunOptions]:
+    fc: Literal["embedded", "ardupilot", "both"], out: Path, seeds: str = "1",
+    worlds: Path | None = None,
+) -> tuple[Console, RunOptions]:  # fmt: skip
     """Console and checked options for a command that flies several flights."""
-    if fc not in _SUITE_KINDS:
-        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
     if out.exists() and not out.is_dir():
         raise ScenarioError(f"{out}: is a file; give a folder as --out")
     console = Console()
@@ -258,7 +241,7 @@ def _runner(
     def say(line: str) -> None:
         console.print(f"[dim]{escape(line)}[/]", highlight=False)
 
-    vehicles = _SUITE_KINDS[fc]
+    vehicles: tuple[VehicleKind, ...] = ("ardupilot", "embedded") if fc == "both" else (fc,)
     return console, RunOptions(vehicles, out, parse_seeds(seeds), worlds, say, LogProgress(console))
 
 

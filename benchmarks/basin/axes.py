@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.basin.run import BasinOutcome, Start, groups, random_start, summary
 from benchmarks.basin.tables import Cells
 from benchmarks.basin.variants import FULL, Variant
-from localizer.registration import JNGOConfig
+from localizer.registration.config import JNGOConfig
 
 AXES = ("yaw", "pitch", "roll", "x", "y", "z")  # camera axes; yaw about y, pitch about x
 STEPS = (1.0, 2.0, 4.0, 6.0, 8.0, 11.0, 15.0)  # degrees or metres

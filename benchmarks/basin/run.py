@@ -18,12 +18,13 @@ import numpy as np
 from benchmarks.basin.variants import FULL, Variant
 from benchmarks.basin.views import BasinView
 from benchmarks.common.shares import wilson
-from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration import JNGO, Registration
+from localizer.registration.jngo import JNGO
+from localizer.registration.result import Registration
 from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import (

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from localizer.geometry.pose import Array
 from localizer.registration import hypotheses as hypothesis_module
-from localizer.registration import select_anchors
+from localizer.registration.anchors import select_anchors
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, Refinement
 from localizer.registration.config import JNGOConfig
 from localizer.registration.jngo import JNGO

@@ -48,8 +48,9 @@ from benchmarks.features.real import real_pairs
 from benchmarks.features.report import PairOutcome, read_outcomes, write_outcomes
 from benchmarks.features.tables import TABLES, report
 from localizer.config import LocalizerConfig
-from localizer.features import GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
+from localizer.features.gradient import GradientExtractor
 from localizer.types import PosePrior
 
 _log = logging.getLogger(__name__)

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.features import FeatureExtractor
+from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.registration import JNGO, PoseConstraint, attitude_constraint
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import PoseConstraint, attitude_constraint
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
 

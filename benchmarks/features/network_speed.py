@@ -3,8 +3,8 @@
     python -m benchmarks.features.network_speed [--s0 MODEL.onnx] [--threads 2] [--json out.json]
 
 Without a model of `s0` an untrained one is exported (extra `train`): weights do not change its
-time. "to host" is what `extract` takes, with every feature copied back; "on device" leaves them on
-the GPU, as in flight. Medians; the first calls, in which engines are built, are not counted.
+time. The features are copied back to the host, as in flight. Medians; the first calls, in which
+engines are built, are not counted.
 """
 
 from __future__ import annotations
@@ -21,25 +21,23 @@ from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
-from localizer.features import OnnxExtractor
-from localizer.features.extractor import SHIPPED_MODEL
+from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor
 from localizer.features.providers import SHORT_NAMES, available_providers
 from localizer.types import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZES = ((320, 240), (512, 512))
-COLUMNS = ("network", "provider", "size", "to host, ms", "on device, ms")
+COLUMNS = ("network", "provider", "size", "time, ms")
 
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """One cell's worth of times, milliseconds; on_device: None on a CPU."""
+    """One row: a network on a provider at an image size."""
 
     model: str
     provider: str
     size: tuple[int, int]
-    to_host: float
-    on_device: float | None
+    time_ms: float
 
 
 def untrained_s0(folder: Path) -> list[Path]:
@@ -93,18 +91,14 @@ def measure(
                 except ModelError as error:
                     print(f"left out: {error}")
                     continue
-                host = median_ms(extractor.extract, image, count)
-                device = None
-                if provider not in ("CPU", "OpenVINO"):
-                    device = median_ms(extractor.extract_on_device, image, count)
-                yield SpeedRow(extractor.info.name, provider, size, host, device)
+                time_ms = median_ms(extractor.extract, image, count)
+                yield SpeedRow(extractor.info.name, provider, size, time_ms)
 
 
 def cells(row: SpeedRow) -> tuple[str, ...]:
     """As `COLUMNS` names them."""
-    device = "-" if row.on_device is None else f"{row.on_device:.2f}"
     size = f"{row.size[0]} x {row.size[1]}"
-    return row.model, row.provider, size, f"{row.to_host:.2f}", device
+    return row.model, row.provider, size, f"{row.time_ms:.2f}"
 
 
 def main() -> None:

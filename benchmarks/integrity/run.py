@@ -15,15 +15,16 @@ from benchmarks.integrity.beginnings import RegistrationStart, beginnings
 from benchmarks.integrity.maps import place_of, shift_of
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
-from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_log
 from localizer.integrity.probability import evidence, place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration import JNGO, Registration
 from localizer.registration.agreement import PatchDisplacements
+from localizer.registration.jngo import JNGO
+from localizer.registration.result import Registration
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.motion import horizontal_sigma_m
 from localizer.tracking.pipeline import reference_anchors

@@ -36,8 +36,9 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
 from localizer.map.relief import ground_uncertainty
-from localizer.odometry import GroundUncertainty, GrowthModel, OdometryConfig
-from localizer.registration import JNGO
+from localizer.odometry.config import GrowthModel, OdometryConfig
+from localizer.odometry.ground import GroundUncertainty
+from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.world import WorldInfo

@@ -14,16 +14,13 @@ from benchmarks.odometry.stretches import TestStretch
 from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.odometry import (
-    GroundUncertainty,
-    OdometryConfig,
-    OdometryFrame,
-    TerrainModel,
-    VisualOdometry,
-    examine,
-    odometry_optimizer,
-)
-from localizer.registration import JNGO, select_anchors
+from localizer.odometry.config import OdometryConfig
+from localizer.odometry.estimate import OdometryFrame
+from localizer.odometry.ground import GroundUncertainty, TerrainModel
+from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.usability import examine
+from localizer.registration.anchors import select_anchors
+from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
 from localizer.types import FeaturePyramid, Image

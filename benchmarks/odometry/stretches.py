@@ -9,7 +9,7 @@ import numpy as np
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import level_camera
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.registration import (
+from localizer.registration.priors import (
     PoseConstraint,
     attitude_constraint,
     combine,

@@ -139,7 +139,8 @@ def schedule_ms(
         schedule.run(query, camera, reference, origin, swarm, config)
         for _ in range(WARM_UP + REPEATS)
     ][WARM_UP:]
-    R, c = world_from_camera(found[-1].rotations, found[-1].translations, origin)
+    best = found[-1].survivors
+    R, c = world_from_camera(best.rotations, best.translations, origin)
     truth = Pose(np.eye(3), np.array([0.0, 0.0, -110.0]))
     error = Pose(R[0], c[0]).distance_to(truth)[0] if len(R) else np.inf
     return (

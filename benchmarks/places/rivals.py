@@ -20,11 +20,14 @@ from benchmarks.basin.variants import paper_rows
 from benchmarks.features.methods import Method, load_xfeat, matched_pose, sift_pnp
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
-from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import FeatureExtractor, load_extractor
+from localizer.features.gradient import GradientExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
-from localizer.registration import JNGO, JNGOConfig, select_anchors
+from localizer.registration.anchors import select_anchors
+from localizer.registration.config import JNGOConfig
+from localizer.registration.jngo import JNGO
 from localizer.render.holes import fill_holes
 from localizer.tracking import motion
 from localizer.tracking.motion import AuxiliarySensors

@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.planning.legs import FORECASTS, PICTURES, TestLeg, draw_legs
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
-from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
 from localizer.forecast.forecast import (
     LEAST_MAP,
     Forecaster,

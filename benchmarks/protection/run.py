@@ -11,12 +11,12 @@ import numpy as np
 from benchmarks.basin.views import BasinView
 from benchmarks.protection.draws import LENSES, InstallationFault, drawn
 from localizer.config import LocalizerConfig
-from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration import JNGO
+from localizer.registration.jngo import JNGO
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PosePrior

@@ -22,8 +22,7 @@ from benchmarks.common.arguments import Parser, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.real.judged import judged_images
 from benchmarks.real.sets import SETS, RealView, describe, load
-from companion.integrity_monitor.config import VideoCheckConfig
-from companion.integrity_monitor.video import detail, thumbnail
+from companion.integrity_monitor.video import LOW_DETAIL, detail, thumbnail
 from localizer.types import Image
 from sitl.camera.faults import darken
 
@@ -78,7 +77,7 @@ def main() -> None:
     )
     p.add_argument("--images", type=whole(1, 100), default=10, help="of each set")
     args = p.parse_args()
-    limit = VideoCheckConfig().low_detail
+    limit = LOW_DETAIL
     bins = list(itertools.pairwise(_EDGES))
     names = " | ".join(f"{low:g} to {high:g}" for low, high in bins)
     print(f"| set | {names} | original below {limit:g} |\n{'|---' * (len(bins) + 2)}|")

@@ -44,7 +44,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration import JNGO
+from localizer.registration.jngo import JNGO
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
 from localizer.relocalization.types import PlaceQuery, SearchRegion
 from localizer.render.numba_raster import NumbaRenderer

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
+from PIL import Image as PillowImage
 
 from companion.writing import result_file, writing
 from localizer.types import Image
@@ -22,7 +21,7 @@ _SHEETS_MM: dict[str, tuple[float, float, float]] = {  # width, height, square
     "a4": (210.0, 297.0, 23.0), "a3": (297.0, 420.0, 33.0), "letter": (215.9, 279.4, 22.0),
 }  # fmt: skip
 _DOTS_PER_SQUARE = 200
-_POINTS_PER_MM = 72.0 / 25.4
+_TEXT_MM = 5.0  # below the board
 
 
 @dataclass(frozen=True)
@@ -58,61 +57,24 @@ def write_sheet(path: Path, paper: Paper) -> BoardPage:
     """
     sheet = BoardPage.of(paper)
     result_file(path, "--print", (".pdf", ".png"))
+    dots_per_inch = 25.4 * _DOTS_PER_SQUARE / sheet.square_mm
     with writing(path, "--print"):
-        path.write_bytes(_pdf(sheet) if path.suffix.lower() == ".pdf" else _png(sheet))
+        if path.suffix.lower() == ".pdf":
+            _page(sheet).convert("1").save(path, resolution=dots_per_inch)
+        else:
+            _page(sheet).save(path, dpi=(dots_per_inch, dots_per_inch))
     return sheet
 
 
-def _pdf(sheet: BoardPage) -> bytes:
-    """A PDF page (1.4) with the board as an image that is placed by millimetres."""
-    picture = board_picture(_DOTS_PER_SQUARE // 4)
-    rows, columns = picture.shape
-    packed = zlib.compress(picture.tobytes())
-    w, h = (_POINTS_PER_MM * x for x in (sheet.width_mm, sheet.height_mm))
-    bw, bh = (_POINTS_PER_MM * sheet.square_mm * n for n in (ACROSS, DOWN))
-    x, y = (w - bw) / 2, (h - bh) / 2
-    say = f"print at 100 %: a square is {sheet.square_mm:g} mm. ChArUco 8 x 11, DICT_4X4_100"
-    page = (
-        f"q {bw:.3f} 0 0 {bh:.3f} {x:.3f} {y:.3f} cm /I Do Q "
-        f"BT /F 8 Tf {x:.1f} {max(y - 14, 8):.1f} Td ({say}) Tj ET"
-    ).encode()
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        (
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {w:.3f} {h:.3f}] /Contents 4 0 R "
-            "/Resources << /XObject << /I 5 0 R >> /Font << /F 6 0 R >> >> >>"
-        ).encode(),
-        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(page), page),
-        b"<< /Type /XObject /Subtype /Image /Width %d /Height %d /ColorSpace /DeviceGray "
-        b"/BitsPerComponent 8 /Filter /FlateDecode /Length %d >>\nstream\n%s\nendstream"
-        % (columns, rows, len(packed), packed),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    out, places = bytearray(b"%PDF-1.4\n"), []
-    for number, body in enumerate(objects, 1):
-        places.append(len(out))
-        out += b"%d 0 obj\n%s\nendobj\n" % (number, body)
-    table = len(out)
-    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
-    out += b"".join(b"%010d 00000 n \n" % place for place in places)
-    out += b"trailer << /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (
-        len(objects) + 1, table,
-    )  # fmt: skip
-    return bytes(out)
-
-
-def _png(sheet: BoardPage) -> bytes:
-    """A white PNG with its dots per metre (pHYs), so that it prints at true scale."""
-    dots = _DOTS_PER_SQUARE
-    per_mm = dots / sheet.square_mm
-    board = board_picture(dots)
+def _page(sheet: BoardPage) -> PillowImage.Image:
+    """The white page with the board in its middle, and the size of a square below it."""
+    per_mm = _DOTS_PER_SQUARE / sheet.square_mm
+    board = board_picture(_DOTS_PER_SQUARE)
     page = np.full((round(sheet.height_mm * per_mm), round(sheet.width_mm * per_mm)), 255, np.uint8)
     top, left = (page.shape[0] - board.shape[0]) // 2, (page.shape[1] - board.shape[1]) // 2
-    page[top : top + board.shape[0], left : left + board.shape[1]] = board
-    data = cv2.imencode(".png", page)[1].tobytes()
-    density = struct.pack(">IIB", round(1000 * per_mm), round(1000 * per_mm), 1)
-    body = b"pHYs" + density
-    chunk = struct.pack(">I", len(density)) + body + struct.pack(">I", zlib.crc32(body))
-    header = 33  # signature and IHDR
-    return data[:header] + chunk + data[header:]
+    bottom = top + board.shape[0]
+    page[top:bottom, left : left + board.shape[1]] = board
+    say = f"print at 100 %: a square is {sheet.square_mm:g} mm. ChArUco 8 x 11, DICT_4X4_100"
+    below = (left, bottom + round(_TEXT_MM * per_mm))
+    cv2.putText(page, say, below, cv2.FONT_HERSHEY_SIMPLEX, 0.8, 0, 2, cv2.LINE_AA)
+    return PillowImage.fromarray(page)

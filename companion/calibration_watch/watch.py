@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration_watch.attitude_filter import AXES, AttitudeFilter
-from companion.calibration_watch.config import CalibrationLimits
 from companion.calibration_watch.observation import (
     AutopilotObservation,
     CalibrationEstimate,
@@ -26,6 +25,10 @@ from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
 Array = NDArray[np.float64]
+# A value above its limit and four of its sigmas raises an alert and inhibits injection.
+FOCAL_SHARE = 0.025  # focal length error
+BORESIGHT_DEG = 3.0  # boresight error against gimbal and autopilot
+TIME_S = 0.08  # time offset
 _WAITS_NS = 700_000_000  # until what the vehicle says of the exposure is there
 _GAP_S = 3.0
 _RATE_NS = 100_000_000  # to both sides of an exposure, for the turn rate
@@ -63,8 +66,7 @@ class _Known:
 class CalibrationWatch:
     """Estimates calibration errors; one thread. Call `add`, then `step`."""
 
-    def __init__(self, limits: CalibrationLimits) -> None:
-        self._limits = limits
+    def __init__(self) -> None:
         self._position, self._attitude = PositionFilter(), AttitudeFilter()
         self._waiting: deque[CalibrationObservation] = deque(maxlen=_QUEUE)
         self._last: InertialDisplacement | None = None
@@ -80,8 +82,7 @@ class CalibrationWatch:
 
     def add(self, observation: CalibrationObservation) -> None:
         """Queue a registered frame that was accepted against the map, for `step`."""
-        if self._limits.enabled:
-            self._waiting.append(observation)
+        self._waiting.append(observation)
 
     def exclude_since(self, since_ns: int) -> None:
         """Exclude frames from since_ns on, because they are frozen or repeated, and undo what the
@@ -107,8 +108,6 @@ class CalibrationWatch:
         """Process the observations that are 0.7 s old, when the autopilot's data of their time is
         there; called a few times a second. track: already integrated (`InertialTrack.follow`).
         """
-        if not self._limits.enabled:
-            return
         state = vehicle.state()
         gnss_m = state.gps_height_m if state.gps_height_m is not None else state.gps_altitude_amsl_m
         if state.gps_fix_type >= 3:
@@ -153,12 +152,11 @@ class CalibrationWatch:
         if not self._fixed:
             return _fused(way, turns) if _is_significant(way) and _agree(way, turns) else way
         surer, other = (way, turns) if way.sigma <= turns.sigma else (turns, way)
-        limit = self._limits.time_s
         # The autopilot's own attitude may lag, too: then the turns are sure of a time that the way
         # over ground does not have, long before the way is sure of its own.
-        contradicted = other.is_within(limit) or not _agree(surer, other, _SPEAKS_AGAINST)
+        contradicted = other.is_within(TIME_S) or not _agree(surer, other, _SPEAKS_AGAINST)
         return (
-            CalibrationEstimate(0.0, math.inf) if surer.exceeds(limit) and contradicted else surer
+            CalibrationEstimate(0.0, math.inf) if surer.exceeds(TIME_S) and contradicted else surer
         )
 
     def _take(

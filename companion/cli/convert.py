@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -19,33 +18,7 @@ from companion.writing import refuse_input, writing
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
 
-
-class InputFormat(str, Enum):
-    """Format of the source."""
-
-    POSES = "poses"
-    TUM = "tum"
-    COLMAP = "colmap"
-    PHOTOS = "photos"
-    AUTOPILOT = "autopilot"
-    RECORD = "record"
-
-
-class OutputFormat(str, Enum):
-    """Format of the result."""
-
-    POSES = "poses"
-    TUM = "tum"
-    COLMAP = "colmap"
-    PHOTOS = "photos"
-    AUTOPILOT = "autopilot"
-
-
-class HeightDatum(str, Enum):
-    """Datum of the heights in photo tags."""
-
-    AMSL = "amsl"
-    ELLIPSOIDAL = "ellipsoidal"
+OutputFormat = Literal["poses", "tum", "colmap", "photos", "autopilot"]
 
 
 def convert_command(
@@ -53,7 +26,9 @@ def convert_command(
         Path, typer.Argument(help="a file; a folder for photos and for the record of a flight")
     ],
     out: Annotated[Path, typer.Argument(help="file to write; a folder of sidecars for photos")],
-    of: Annotated[InputFormat, typer.Option("--from", help="format of the source")],
+    of: Annotated[
+        Literal[OutputFormat, "record"], typer.Option("--from", help="format of the source")
+    ],
     to: Annotated[OutputFormat, typer.Option("--to", help="format of the result")],
     map_cache: Annotated[
         Path | None, typer.Option("--map", help="tile cache with the ENU frame")
@@ -62,7 +37,8 @@ def convert_command(
         str | None, typer.Option(help="LAT,LON,HEIGHT of the ENU frame, instead of --map")
     ] = None,
     heights: Annotated[
-        HeightDatum | None, typer.Option(help="datum of the heights in photo tags")
+        Literal["amsl", "ellipsoidal"] | None,
+        typer.Option(help="datum of the heights in photo tags"),
     ] = None,
     geoid_separation: Annotated[
         float | None, typer.Option(help="geoid above the ellipsoid, m; default: the map's")
@@ -83,15 +59,15 @@ def convert_command(
         separation = _on_earth(geoid_separation)
     above = None
     if heights is not None:
-        if heights is HeightDatum.AMSL and separation is None:
+        if heights == "amsl" and separation is None:
             raise ConfigError("--heights amsl needs --geoid-separation or --map")
-        above = Heights(heights.value, separation or 0.0)
+        above = Heights(heights, separation or 0.0)
     notes: list[str] = []
     place = MapReference(frame, above, notes.append)
     with show_work(Console(stderr=True), f"converting {source}"):
-        poses = _dated(READERS[of.value](source, place), times, needed=to is OutputFormat.TUM)
+        poses = _dated(READERS[of](source, place), times, needed=to == "tum")
         with writing(out):
-            WRITERS[to.value](out, poses, place)
+            WRITERS[to](out, poses, place)
     for note in notes:
         Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
     typer.echo(f"{out}: {len(poses)} poses")
@@ -102,7 +78,7 @@ def _refuse_footage(source: Path, out: Path, to: OutputFormat) -> None:
     from companion.recorded.photo_tags import PHOTO_SUFFIXES, RAW_SUFFIXES
     from companion.recorded.video import VIDEO_SUFFIXES
 
-    if to is OutputFormat.PHOTOS:
+    if to == "photos":
         refuse_input(out, "OUT", source.parent if source.is_file() else None)
     elif out.suffix.lower() in PHOTO_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES | {".xmp"}:
         raise ConfigError(f"OUT {out}: a footage file's name; give a text file, as poses.txt")

@@ -23,7 +23,8 @@ from companion.config import load_config
 from companion.terminal.steps import show_steps, show_work
 from companion.versions import made_by, processor
 from companion.writing import refuse_input, result_file, write_result
-from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
+from mavlink_bridge.preflight.doctor import Diagnosis
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 if TYPE_CHECKING:
     from companion.preflight.bench import BenchRow

@@ -7,9 +7,10 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -17,6 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.shared_options import Device, FeatureNetwork, Renderer, WorkingWidth
 from companion.errors import ConfigError
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import sequence_of
@@ -45,10 +47,8 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.trajectory import StampedPose, write_tum
 from localizer.pictures import write_rgb
-from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.render.base import MapRenderer
-from localizer.render.select import RendererName
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Undistorter
 
@@ -67,7 +67,7 @@ def evaluate_command(
     report: Annotated[Path, typer.Option(help="folder of the report")] = Path("eval-report"),
     name: Annotated[str | None, typer.Option(help="sequence of the PiLoT data set")] = None,
     prior: Annotated[
-        str,
+        Literal["first", "each", "lost", "none"],
         typer.Option(
             help="approximate pose of: first, the first frame; each, every frame; lost, the first, "
             "100 to 500 m off; none: search"
@@ -98,20 +98,13 @@ def evaluate_command(
             min=0.01, max=1000, help="also use height, with random errors of this sigma, m"
         ),
     ] = None,
-    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
-    renderer: Annotated[
-        RendererName, typer.Option(help="auto: a GPU if there is one, otherwise numba")
-    ] = "auto",
-    device: Annotated[
-        DeviceChoice,
-        typer.Option(help="runs the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
-    ] = "auto",
-    model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
+    width: WorkingWidth = 320,
+    renderer: Renderer = "auto",
+    device: Device = "auto",
+    model: FeatureNetwork = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
 ) -> None:
     """Localize every frame of a recorded sequence from a perturbed prior and measure it."""
-    if prior not in ("first", "each", "lost", "none"):
-        raise ConfigError(f"--prior is first, each, lost or none, not {prior!r}")
     searched = prior in ("lost", "none")
     if known_heading and not searched:
         raise ConfigError("--known-heading goes with --prior lost or none")
@@ -241,7 +234,7 @@ def _write_report(
     local: LocalFrame,
 ) -> None:
     unusable = [f.name for f in frames if f.unusable]
-    report = metrics.to_dict() | {
+    report = asdict(metrics) | {
         "unusable_images": unusable, "settings": settings, "versions": made_by()
     }  # fmt: skip
     (folder / "report.json").write_text(json.dumps(report, indent=2))

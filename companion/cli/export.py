@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.before.shared_options import RecordMap, RecordTlog
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count, show_steps, tally
 from companion.writing import result_file
@@ -24,7 +25,7 @@ def export_command(
     out: Annotated[
         Path | None, typer.Option(help="file to write; default: record.mcap in the record")
     ] = None,
-    tlog: Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")] = None,
+    tlog: RecordTlog = None,
 ) -> None:
     """Write a record in a format that other programs open."""
     if not mcap:
@@ -48,9 +49,7 @@ def klv_command(
     out: Annotated[
         Path | None, typer.Option(help="file to write; default: .klv.ts beside the video")
     ] = None,
-    map_cache: Annotated[
-        Path | None, typer.Option("--map", help="instead of the record's map")
-    ] = None,
+    map_cache: RecordMap = None,
     begin: Annotated[
         float | None,
         typer.Option(

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.before.shared_options import Device, FeatureNetwork, Renderer, WorkingWidth
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
 from companion.offline.localize import (
@@ -31,8 +32,6 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
-from localizer.registration.devices import DeviceChoice
-from localizer.render.select import RendererName
 from localizer.tracking.opening import open_localizer
 from localizer.types import PoseEstimate
 
@@ -79,15 +78,10 @@ def localize_command(
     rate_hz: Annotated[
         float, typer.Option(min=0.001, max=1000, help="frame rate of images without timestamps.txt")
     ] = 30.0,
-    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
-    renderer: Annotated[
-        RendererName, typer.Option(help="auto: a GPU if there is one, otherwise numba")
-    ] = "auto",
-    device: Annotated[
-        DeviceChoice,
-        typer.Option(help="runs the optimizer; auto, cuda: a working GPU, otherwise the CPU"),
-    ] = "auto",
-    model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
+    width: WorkingWidth = 320,
+    renderer: Renderer = "auto",
+    device: Device = "auto",
+    model: FeatureNetwork = None,
 ) -> None:
     """Localize images against a map. Exit code 1: none was localized."""
     if not images.exists():

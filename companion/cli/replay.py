@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.shared_options import Record, RecordMap, RecordTlog
 from companion.cli.console import require_extra, serve
 from companion.errors import ConfigError, RecordError
 from companion.live.config import ConsoleConfig
@@ -20,11 +21,9 @@ from localizer.geometry.pose import Array
 
 
 def replay_command(
-    record: Annotated[Path, typer.Argument(help="folder that `companion run` recorded")],
-    tlog: Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")] = None,
-    map_cache: Annotated[
-        Path | None, typer.Option("--map", help="instead of the record's map")
-    ] = None,
+    record: Record,
+    tlog: RecordTlog = None,
+    map_cache: RecordMap = None,
     tolerance_m: Annotated[
         float, typer.Option(min=0, help="allowed difference, m; 95 % of the positions must meet it")
     ] = 1.0,

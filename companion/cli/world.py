@@ -24,7 +24,8 @@ def build(
     out: Annotated[Path, typer.Option(help="folder of the tileset")],
     seed: Annotated[int, typer.Option(min=0, help="seed of the world")] = 0,
     variant: Annotated[
-        str, typer.Option(help="survey: as a map shows it; live: another day and season")
+        Literal["survey", "live"],
+        typer.Option(help="survey: as a map shows it; live: another day and season"),
     ] = "survey",
     size: Annotated[
         float, typer.Option(min=400, max=4000, help="side length, a multiple of 400 m")
@@ -33,10 +34,7 @@ def build(
     """Generate a world and write it as a 3D Tiles 1.1 tileset."""
     from localizer.synth.world import build_world
 
-    if variant not in ("survey", "live"):
-        raise typer.BadParameter(f"variant is survey or live, not {variant!r}")
-    chosen: Literal["survey", "live"] = "survey" if variant == "survey" else "live"
     work = show_work(Console(stderr=True), f"building world {seed} ({variant})")
     with writing(out, "--out"), work:
-        info = build_world(seed, out, variant=chosen, size_m=size)
+        info = build_world(seed, out, variant=variant, size_m=size)
     Console().print(f"[green]{out}/tileset.json[/]: world {seed}, {info.size_m:.0f} m a side")

@@ -10,12 +10,13 @@ import numpy as np
 from companion.console.record_rows import ABSURD, estimate_of, last_row
 from companion.errors import StreamDecodeError
 from companion.live.protocol import Message
+from companion.live.shown import pose_data
 from companion.offline.record import RecordTables, is_time_ns
 from companion.offline.tables import Columns, poses
 from companion.reporting.pictures import MapPictures
 from companion.sources.folder_source import read_image
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose, quaternion_from_matrix
+from localizer.geometry.pose import Pose
 
 
 class KeptPictures:
@@ -58,7 +59,7 @@ class KeptPictures:
             pose = _pose_of(self._tables.estimates, row)
             if pose is not None:
                 estimate = estimate_of(self._tables.estimates, row)
-                head["estimate"] = estimate | {"pose": _pose_head(pose)}
+                head["estimate"] = estimate | {"pose": pose_data(pose)}
                 parts += self._seen_from(pose, camera, head) if estimate["accepted"] else []
         return Message(head, b"".join(parts))
 
@@ -68,7 +69,7 @@ class KeptPictures:
             return []
         target = camera.without_distortion()
         view = self._map.renderer.render(pose, target, wait=True)
-        head["view"] = {"camera": target.to_dict(), "pose": _pose_head(pose)}
+        head["view"] = {"camera": target.to_dict(), "pose": pose_data(pose)}
         return [view.rgb.tobytes(), view.depth.tobytes()]
 
 
@@ -81,10 +82,3 @@ def _pose_of(columns: Columns, row: int) -> Pose | None:
     if sum(float(values[f"q{x}"][0]) ** 2 for x in "wxyz") < 0.5:
         return None  # no rotation
     return poses(values)[0]
-
-
-def _pose_head(pose: Pose) -> dict[str, list[float]]:
-    return {
-        "q": [float(x) for x in quaternion_from_matrix(pose.rotation)],
-        "t": [float(x) for x in pose.translation],
-    }

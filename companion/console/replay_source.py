@@ -78,15 +78,13 @@ class ReplaySource:
 
     async def run(self) -> None:
         """Play until cancelled; pauses at the end of the record."""
-        self.newest.add(Message({"kind": "hello", "mode": "record", **self._limits()}))
+        limits = {"delay_ms": self._tables.delay_ms, "alert_limit_m": self._tables.alert_limit_m}
+        self.newest.add(Message({"kind": "hello", "mode": "record", **limits}))
         while True:
             await self._show()
             await asyncio.sleep(_STEP_S)
             if self._playing:
                 self._at_s = min(self._at_s + _STEP_S, self._length_s)
-
-    def _limits(self) -> dict[str, Any]:
-        return {"delay_ms": self._tables.delay_ms, "alert_limit_m": self._tables.alert_limit_m}
 
     async def _show(self) -> None:
         now_ns = self._start_ns + round(self._at_s * 1e9)

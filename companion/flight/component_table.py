@@ -70,7 +70,6 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.injection.restart_memory import RestartMemory
 from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
@@ -297,9 +296,7 @@ def _vital_signs(context: BuildContext) -> VitalSigns:
 
 def _autopilot(context: BuildContext) -> AutopilotPose:
     bridge = context[Bridge]
-    autopilot = AutopilotPose(
-        bridge, context[CameraExtrinsics], context.config.prior, lambda: bridge.on_gnss
-    )
+    autopilot = AutopilotPose(bridge, context[CameraExtrinsics], lambda: bridge.on_gnss)
     context.channels.estimates.subscribe(
         lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
     )
@@ -312,7 +309,6 @@ def _last_fix(context: BuildContext) -> FixMemory:
     folder = config.state_folder
     memory = FixMemory(
         folder and folder / "last-fix.json",
-        config.prior,
         context[AutopilotPose],
         context[CameraExtrinsics],
         lambda time_ns: local_near(bridge, time_ns),
@@ -635,4 +631,4 @@ def _inhibit_memory(config: CompanionConfig) -> InhibitMemory | None:
     cameras = [one.model_dump(mode="json") for one in (config.camera, config.bridge.camera)]
     about = json.dumps([readable_map_hash(config.map), *cameras])  # escaped: paths may be no UTF-8
     digest = hashlib.sha256(about.encode()).hexdigest()
-    return InhibitMemory(RestartMemory(file.with_name("guardian-forbids.json"), about=digest))
+    return InhibitMemory(file.with_name("guardian-forbids.json"), about=digest)

@@ -14,10 +14,6 @@ from companion.flight.channels import Channels
 T = TypeVar("T")
 
 
-def _always(_: CompanionConfig) -> bool:
-    return True
-
-
 @dataclass(frozen=True)
 class Component(Generic[T]):
     """One row of the table: how a component is built, started, stopped and closed.
@@ -42,7 +38,7 @@ class Component(Generic[T]):
     """Undoes `make`, where that opened something."""
     hand_over: Callable[[T], None] | None = None
     """Called before an end that is none in order: another process takes over what it remembers."""
-    wanted: Callable[[CompanionConfig], bool] = _always
+    wanted: Callable[[CompanionConfig], bool] = lambda _: True
     """Whether this deployment has the part at all."""
     ahead: bool = False
     """Whether a standby makes it before it may fly; it needs only parts that are made so, too."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import threading
 import time
@@ -19,7 +18,7 @@ import numpy as np
 from companion.ending import wait_for_end
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.sources import StreamState
-from companion.writing import NewestFile
+from companion.writing import NewestFile, json_value
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
@@ -98,16 +97,10 @@ class HealthMonitor:
         record_folder: Path | None,
         inputs: HealthInputs | None = None,
     ) -> None:
-        inputs = inputs or HealthInputs()
+        self._inputs = inputs or HealthInputs()
         self._engine_health = engine_health
         self._bridge = bridge
         self._feed_state = feed_state
-        self._is_recorded = inputs.is_recorded
-        self._position_sigma_m = inputs.position_sigma_m
-        self._integrity_monitor = inputs.integrity_monitor
-        self._unreadable_nodes = inputs.unreadable_nodes
-        self._map_shift, self._targets = inputs.map_shift, inputs.targets
-        self._search_lacks = inputs.search_lacks
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
@@ -197,7 +190,8 @@ class HealthMonitor:
             return HealthStatus(HealthLevel.STARTING, (alert(waiting),))
         arrived, estimate = self._estimates[-1]
         is_old = time.monotonic() - arrived > _STALE_S
-        if _is_lost(estimate):  # the error stands in health.json; this is what to act on
+        # The error of a lost position stands in health.json; this is what to act on.
+        if estimate.state is TrackingState.LOST:
             return HealthStatus(HealthLevel.FAILED, self._lost(estimate, engine))
         if is_old:
             failed = alert(_error(engine)) if engine.last_error else None
@@ -209,7 +203,8 @@ class HealthMonitor:
         """Health while frames are processed and the position is not lost."""
         level, news = _state_alert(estimate)
         overload = self._overload(engine)
-        held = self._integrity_monitor.reason if self._integrity_monitor is not None else None
+        monitor = self._inputs.integrity_monitor
+        held = monitor.reason if monitor is not None else None
         if held is not None:  # the monitor told it
             return HealthStatus(HealthLevel.FAILED, (held,), is_reported=True)
         if level is not HealthLevel.OK:
@@ -226,9 +221,9 @@ class HealthMonitor:
     def _notes(self, feed: StreamState) -> tuple[Alert, ...]:
         """Further active alerts: unreadable parts of the map, scaled video, incomplete record."""
         notes = (
-            (self._unreadable_nodes() > 0, AlertId.MAP_UNREADABLE),
+            (self._inputs.unreadable_nodes() > 0, AlertId.MAP_UNREADABLE),
             (feed is StreamState.SCALED, AlertId.VIDEO_SCALED),
-            (not self._is_recorded(), AlertId.RECORD_INCOMPLETE),
+            (not self._inputs.is_recorded(), AlertId.RECORD_INCOMPLETE),
         )
         return tuple(alert(of) for holds, of in notes if holds)
 
@@ -256,7 +251,7 @@ class HealthMonitor:
         fix_ns = estimate.last_fix_ns
         since_s = 0.0 if fix_ns is None else (time.monotonic_ns() - fix_ns) * 1e-9
         alerts = [alert(AlertId.LOST, seconds=since_s)]
-        sigma_m, lacks = self._position_sigma_m(), self._search_obstacle(engine)
+        sigma_m, lacks = self._inputs.position_sigma_m(), self._search_obstacle(engine)
         if sigma_m is not None:
             alerts.append(alert(AlertId.EKF_UNCERTAIN, metres=2.0 * sigma_m))
         if lacks is not None:
@@ -265,7 +260,7 @@ class HealthMonitor:
 
     def _search_obstacle(self, engine: EngineHealth) -> AlertId | None:
         """Why the map cannot be searched now; None if it can."""
-        return AlertId.SEARCH_HANGS if engine.search_hangs else self._search_lacks()
+        return AlertId.SEARCH_HANGS if engine.search_hangs else self._inputs.search_lacks()
 
     def _write(self, level: str, text: str, alerts: tuple[Alert, ...]) -> None:
         score = self._bridge.shadow_score()
@@ -280,13 +275,13 @@ class HealthMonitor:
             "stages_ms": _stages([e for _, e in list(self._estimates)]),
             "bridge": self._bridge.counters(),
             "shadow": {"ready": score.ready, "text": score.line()},
-            "guardian": _monitor_report(self._integrity_monitor),
-            "map_shift": self._map_shift(),
-            "targets": self._targets(),
+            "guardian": _monitor_report(self._inputs.integrity_monitor),
+            "map_shift": self._inputs.map_shift(),
+            "targets": self._inputs.targets(),
         }
         self.newest = report
         if self._file is not None:
-            self._file.put(json.dumps(_finite(report), indent=1, default=str))
+            self._file.put(json.dumps(json_value(report), indent=1))
 
     def _rate(self) -> float:
         """Localized frames per second over the last few seconds."""
@@ -359,16 +354,3 @@ def _state_alert(estimate: PoseEstimate) -> tuple[HealthLevel, Alert]:
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
     bridging = alert(AlertId.BRIDGING, seconds=since_ns * 1e-9, metres=2.0 * sigma_m)
     return HealthLevel.DEGRADED, bridging
-
-
-def _is_lost(estimate: PoseEstimate) -> bool:
-    return estimate.state is TrackingState.LOST
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers that are not finite by null, because JSON has none."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -21,12 +21,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, TypeAdapter
 
-from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
 from companion.ending import wait_for_end
 from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
+from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 from mavlink_bridge.atomic_file import read_small_file, replace_file
 from mavlink_bridge.link.clock import boot_id
@@ -34,6 +34,7 @@ from mavlink_bridge.messages import Origin, VehicleState
 
 _log = logging.getLogger(__name__)
 _WRITE_S = 0.5
+_RECALL_S = 20.0  # oldest confirmed position that a restart uses
 _FASTEST_MPS = 40.0  # a way beyond it is a jump of the EKF
 _LEAST_SIGMA_M = 0.5
 _FARTHEST_M = 1e6
@@ -118,14 +119,13 @@ class FixMemory:
     def __init__(
         self,
         path: Path | None,
-        config: PriorConfig,
         autopilot: AutopilotPose,
         extrinsics: CameraExtrinsics,
         local_at: LocalAt,
         trusted: Callable[[], bool] = lambda: True,
         state: Callable[[], VehicleState] = VehicleState,
     ) -> None:
-        self._path, self._config = path, config
+        self._path = path
         self._autopilot, self._extrinsics = autopilot, extrinsics
         self._local_at, self._trusted, self._state = local_at, trusted, state
         self._boot = boot_id()
@@ -168,7 +168,7 @@ class FixMemory:
         if last is None:
             return None
         age_s = (time_ns - last.time_ns) * 1e-9
-        if not 0.0 <= age_s <= self._config.recall_s:
+        if not 0.0 <= age_s <= _RECALL_S:
             self._before = None
             return None
         local, rotation = self._local_at(time_ns), self._autopilot.rotation(time_ns)
@@ -186,8 +186,7 @@ class FixMemory:
         )
         sigma_m = math.hypot(max(last.sigma_m, _LEAST_SIGMA_M), drift_sigma_m(age_s))
         pose = Pose(rotation, np.asarray(begun) + NED_FROM_ENU.T @ way)
-        degrees = self._config.rotation_sigma_deg
-        prior = PosePrior.around(pose, sigma_m, degrees, time_ns)
+        prior = PosePrior.around(pose, sigma_m, SENSORS.heading_deg, time_ns)
         return PosePrior(
             pose, prior.covariance, time_ns, self._autopilot.velocity, independent=True
         )

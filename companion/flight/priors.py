@@ -13,8 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics, camera_rotation, vehicle_prior
+from companion.inertial import AttitudeTelemetry
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.sensors.error_model import SENSORS
@@ -22,7 +22,7 @@ from localizer.tracking.engine import PriorProvider
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.injection.shadow import gnss_healthy
-from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
 _CONST_POSITION = 128  # EKF_CONST_POS_MODE of EKF_STATUS_REPORT (193): it only knows that it is
@@ -38,20 +38,8 @@ _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
 _BESIDE_M, _REPORT_S = 3.0, 0.5  # of the receiver: an EKF farther off follows something else
 
 
-class AutopilotSource(Protocol):
-    """Telemetry that the priors read: from the bridge in flight, from a record afterwards."""
-
-    def state(self) -> VehicleState:
-        """Newest state of the vehicle."""
-        ...
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
-        ...
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a CLOCK_MONOTONIC time; None if unknown."""
-        ...
+class AutopilotSource(AttitudeTelemetry, Protocol):
+    """Telemetry that the priors read."""
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's position (north, east, down) from its origin, m, at a CLOCK_MONOTONIC time;
@@ -95,8 +83,7 @@ class PositionQualityMonitor:
     Thread-safe: the localization thread passes estimates, the bridge's thread states.
     """
 
-    def __init__(self, config: PriorConfig) -> None:
-        self._base_m = config.position_sigma_m
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._gnss_ns: int | None = None
         self._fix_ns: int | None = None
@@ -117,13 +104,13 @@ class PositionQualityMonitor:
             known = [t for t in (self._gnss_ns, self._fix_ns) if t is not None]
         if healthy:
             own_m = state.gps_h_accuracy_m or 0.0
-            return PositionQuality(max(self._base_m, own_m), independent=True)
+            return PositionQuality(max(SENSORS.start_m, own_m), independent=True)
         if state.ekf_flags and not state.ekf_flags & _HORIZONTAL:
             return PositionQuality(None, independent=False)
         if not known:
             return PositionQuality(_UNTOLD_SIGMA_M, independent=False)
         return PositionQuality(
-            math.hypot(self._base_m, drift_sigma_m((now_ns - max(known)) * 1e-9)),
+            math.hypot(SENSORS.start_m, drift_sigma_m((now_ns - max(known)) * 1e-9)),
             independent=False,
         )
 
@@ -151,13 +138,11 @@ class AutopilotPose:
         self,
         autopilot: AutopilotSource,
         extrinsics: CameraExtrinsics,
-        config: PriorConfig,
         on_gnss: Callable[[], bool | None] = lambda: True,
     ) -> None:
         self._autopilot, self._on_gnss = autopilot, on_gnss
         self._extrinsics = extrinsics
-        self._config = config
-        self.belief = PositionQualityMonitor(config)
+        self.belief = PositionQualityMonitor()
 
     def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
         """Note the time of an accepted estimate that `reaches_ekf`. Never blocks.
@@ -228,7 +213,7 @@ class AutopilotPose:
             self._autopilot.attitude_at(time_ns),
             self._autopilot.gimbal_at(time_ns),
             self._extrinsics,
-            (belief.sigma_m, float(np.radians(self._config.rotation_sigma_deg))),
+            (belief.sigma_m, float(np.radians(SENSORS.heading_deg))),
             time_ns,
         )
         return replace(prior, independent=belief.independent) if prior is not None else None

@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.calibration_watch.ground import GroundView
 from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
-from companion.calibration_watch.watch import CalibrationWatch
+from companion.calibration_watch.watch import BORESIGHT_DEG, FOCAL_SHARE, TIME_S, CalibrationWatch
 from companion.inertial import InertialTrack, VehicleTelemetry
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import ActiveAlerts, AlertDebouncer, CheckResult
@@ -23,7 +23,13 @@ from companion.integrity_monitor.protection import ProtectionLevel, protection_l
 from companion.integrity_monitor.scale import ScaleCheck
 from companion.integrity_monitor.step import StepUncertainty
 from companion.integrity_monitor.tilt import TiltCheck
-from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
+from companion.integrity_monitor.video import (
+    LOW_DETAIL,
+    REPEAT_S,
+    STILL_SHARE,
+    FrameVerdict,
+    FrozenVideoDetector,
+)
 from localizer.types import Image
 from mavlink_bridge.alerts.alert import Alert, Inhibits, OutputAction
 from mavlink_bridge.alerts.ids import AlertId
@@ -33,6 +39,7 @@ from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _AIRBORNE_M = 3.0
 _IDENTICAL_S = 1.5
+_STILL_S = 3.0  # time after which a frozen frame is reported
 _STILL_PER_M = 90.0  # s/m: how much longer where the limit is more metres on the ground
 _STILL_FIRST_S = 2.0
 _MOVED_M, _MOVED_SPEED_MPS, _MOVED_LEAST_S = 2.0, 1.5, 0.35
@@ -73,23 +80,22 @@ class IntegrityChecks:
         limits: IntegrityLimits,
         track: InertialTrack | None = None,
     ) -> None:
-        self._config, self._limits = config, limits
-        self._pictures = FrozenVideoDetector(config.picture)
+        self._protection, self._limits = config.protection, limits
+        self._pictures = FrozenVideoDetector()
         self._track = track or InertialTrack()
-        self._motion = MotionCheck(config.motion, self._track)
+        self._motion = MotionCheck(self._track)
         self._scale = ScaleCheck(self._track)
-        self._height = HeightCheck(config)
-        self._gnss = GnssCheck(config)
-        self._jumps = JumpCheck(config)
-        self._steps = StepUncertainty(config.unreported_jump_m)
-        self._tilt = TiltCheck(config)
+        self._height = HeightCheck()
+        self._gnss = GnssCheck()
+        self._jumps = JumpCheck()
+        self._steps = StepUncertainty()
+        self._tilt = TiltCheck()
         self._ekf = EkfWatch()
-        self._calibration = CalibrationWatch(config.calibration)
+        self._calibration = CalibrationWatch()
         self._ground = GroundView(limits.horizontal_fov_deg)
         specs = {spec.id: spec for spec in INTEGRITY}
-        gnss, limit = specs[AlertId.GNSS_VISION_MISMATCH], specs[AlertId.HPL_OVER_LIMIT]
+        limit = specs[AlertId.HPL_OVER_LIMIT]
         raise_s = min(limit.raise_s, limits.time_to_alert_s)
-        specs[gnss.id] = replace(gnss, repeat_s=config.gnss_repeat_s)
         specs[limit.id] = replace(limit, raise_s=raise_s)
         self._debouncers = {of: AlertDebouncer(spec) for of, spec in specs.items()}
         self._picture: tuple[int, FrameVerdict] | None = None
@@ -194,7 +200,7 @@ class IntegrityChecks:
         position_error_m = self._estimated_error_m(state, height_m)
         moving = _moving_now(state, fix.time_ns)
         self._level = level = protection_level(
-            fix, moving, self._config.protection, position_error_m, height_m
+            fix, moving, self._protection, position_error_m, height_m
         )
         scale = None if fix.scale_sigma is None else max(fix.scale_sigma, self._scale.scale_error)
         levels = (level.horizontal_m, level.vertical_m)
@@ -240,7 +246,7 @@ class IntegrityChecks:
             found = self._steps.add(self._jumps.step)
             if found is not None:
                 self._calibration.suspect_timestamps(found.time_ns)
-        no_delay_s = max(self._config.calibration.time_s, 0.5 * self._steps.delay_s)
+        no_delay_s = max(TIME_S, 0.5 * self._steps.delay_s)
         if self._calibration.figures().late_s.is_within(no_delay_s):
             self._steps.confirm_timestamps()
 
@@ -252,7 +258,7 @@ class IntegrityChecks:
             return
         time_ns, verdict = self._picture
         if verdict.repeat_lag_s > 0.0 or self._debouncers[AlertId.VIDEO_REPEATS].raised:
-            found_s = self._config.picture.repeat_s + _REPEATS_BEFORE_S
+            found_s = REPEAT_S + _REPEATS_BEFORE_S
             self._calibration.exclude_since(time_ns - int(found_s * 1e9))
         elif verdict.still_s >= _IDENTICAL_S or self._debouncers[AlertId.VIDEO_FROZEN].raised:
             self._calibration.exclude_since(time_ns - int(verdict.still_s * 1e9))
@@ -307,16 +313,14 @@ class IntegrityChecks:
         return {of: check() for of, check in checks.items()}
 
     def _calibration_checks(self) -> dict[AlertId, Callable[[], CheckResult]]:
-        limits, known = self._config.calibration, self._calibration.figures()
+        known = self._calibration.figures()
         share, late = known.focal, known.late_s
         long = CalibrationError.LONG if share.value > 0.0 else CalibrationError.SHORT
         when = CalibrationError.LATE if late.value > 0.0 else CalibrationError.EARLY
         return {
-            AlertId.FOCAL_LENGTH: lambda: _beyond(share, limits.focal_share, 100.0, long),
-            AlertId.BORESIGHT: lambda: _beyond(
-                known.boresight_deg, limits.boresight_deg, 1.0, known.axis
-            ),
-            AlertId.TIME_OFFSET: lambda: _beyond(late, limits.time_s, 1e3, when),
+            AlertId.FOCAL_LENGTH: lambda: _beyond(share, FOCAL_SHARE, 100.0, long),
+            AlertId.BORESIGHT: lambda: _beyond(known.boresight_deg, BORESIGHT_DEG, 1.0, known.axis),
+            AlertId.TIME_OFFSET: lambda: _beyond(late, TIME_S, 1e3, when),
         }
 
     def _estimated_error_m(self, state: VehicleState, height_m: float | None) -> float:
@@ -348,7 +352,7 @@ class IntegrityChecks:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
             return CheckResult(None)
         shown = self._picture[1].detail
-        return CheckResult(shown < self._config.picture.low_detail, shown)
+        return CheckResult(shown < LOW_DETAIL, shown)
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
@@ -363,8 +367,8 @@ class IntegrityChecks:
 
     def _still_s(self, now_ns: int, state: VehicleState) -> float:
         """How long the image of a hover may show no motion, s; longer high above the ground."""
-        ground_m = self._config.picture.still_share * self._ground.width_m(state, now_ns)
-        return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)
+        ground_m = STILL_SHARE * self._ground.width_m(state, now_ns)
+        return max(_STILL_S, _STILL_FIRST_S + _STILL_PER_M * ground_m)
 
     def _repeats(self, now_ns: int) -> CheckResult:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:

@@ -87,16 +87,14 @@ ActiveAlerts = Mapping[AlertId, tuple[float, CalibrationError]]
 """Figure and word of active alerts."""
 
 
-class InhibitMemory:
-    """Remembers over a restart the active alerts that inhibit injection; see `RestartMemory`."""
+class InhibitMemory(RestartMemory):
+    """Remembers over a restart the active alerts that inhibit injection."""
 
-    def __init__(self, memory: RestartMemory) -> None:
-        self._memory = memory
-        self._kept: frozenset[AlertId] = frozenset()
+    _kept: frozenset[AlertId] = frozenset()
 
     def recall(self) -> ActiveAlerts:
         """The alerts that were active before the restart; empty after a clean shutdown."""
-        kept = self._memory.recall()
+        kept = self.recall_state()
         kept_alerts = None if kept is None else kept[0].get("inhibits")
         rows = kept_alerts.items() if isinstance(kept_alerts, dict) else ()
         known = {spec.id.value: spec.id for spec in CATALOGUE.values()
@@ -112,13 +110,9 @@ class InhibitMemory:
             return
         self._kept = frozenset(found)
         if found:
-            self._memory.store({"inhibits": {of.value: row for of, row in found.items()}})
+            self.store_state({"inhibits": {of.value: row for of, row in found.items()}})
         else:
-            self._memory.drop()
-
-    def stop(self, *, clean_shutdown: bool = True) -> None:
-        """End the memory; a clean shutdown deletes what is stored (see `RestartMemory.stop`)."""
-        self._memory.stop(clean_shutdown=clean_shutdown)
+            self.drop()
 
 
 def _parse_row(value: Any) -> tuple[float, CalibrationError] | None:

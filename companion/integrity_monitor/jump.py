@@ -7,13 +7,14 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.heading import HeadingChange, HeadingHistory, heading_change
 from companion.integrity_monitor.position_checks import LocalPlace
-from companion.integrity_monitor.step import PositionStep
+from companion.integrity_monitor.step import UNREPORTED_JUMP_M, PositionStep
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
+_JUMP_M = 10.0  # announced jumps above this are held
+_HOLD_S = 5.0  # time that a jumped position must agree in motion
 _SIGMAS = 4.0
 _DRIFT_MPS2 = 0.2  # what a velocity carried on may be wrong by, as an acceleration
 _SPEED_MPS = 1.0  # and of its speed
@@ -111,8 +112,7 @@ class JumpCheck:
     IMU, or whose heading turned unlike gyros and autopilot, does not pass by waiting.
     """
 
-    def __init__(self, config: IntegrityMonitorConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._place = LocalPlace()
         self._reckoning = EkfDisplacement()
         self._passed: _Passed | None = None
@@ -163,7 +163,7 @@ class JumpCheck:
         if step is not None and is_turned:
             jump_m += step.growth_m  # nor does time explain it
         explained = self.announced and not is_turned
-        if jump_m <= (self._config.jump_m if explained else self._config.unreported_jump_m):
+        if jump_m <= (_JUMP_M if explained else UNREPORTED_JUMP_M):
             self.step = step
             is_predicted = step is not None and step.is_predicted
             self._predictions = self._predictions + 1 if is_predicted else 0
@@ -174,7 +174,7 @@ class JumpCheck:
         held = self._hold(fix)
         held.add_heading(turn, is_turned=is_turned)
         speaks_against = held.contradicted or (held.turned and is_turned)
-        if agrees and not speaks_against and held.seconds >= self._config.jump_hold_s:
+        if agrees and not speaks_against and held.seconds >= _HOLD_S:
             self._predictions = 0
             self._pass(fix, state)
             self._headings = held.headings
@@ -255,7 +255,7 @@ class JumpCheck:
         """Whether an aircraft can fly from the held fix to this one, at up to 30 m/s."""
         apart_m = math.hypot(*self._off(held, (0.0, 0.0), fix))
         reach_m = _FASTEST_MPS * max(_seconds(held, fix), 0.0)
-        return apart_m <= self._config.unreported_jump_m + reach_m + _SIGMAS * _sigmas(held, fix)
+        return apart_m <= UNREPORTED_JUMP_M + reach_m + _SIGMAS * _sigmas(held, fix)
 
 
 def _drift_sigma_m(dt: float) -> float:

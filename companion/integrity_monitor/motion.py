@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.inertial import InertialDisplacement, InertialTrack
-from companion.integrity_monitor.config import MotionCheckConfig
 from companion.integrity_monitor.position_checks import LocalPlace
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.messages import VisionFix
@@ -31,7 +30,8 @@ _SIGMAS = 4.0
 # tilt that it does not model carries it: honest fixes of sigma 2 m were withheld for 4 m (SITL).
 _SLOW_SHARE = 1.5
 _INDEPENDENT_HZ = 2.0  # errors of vision are alike within half a second
-_WINDOWS_S = (1.0, 3.0, 10.0)
+_LIMITS_M = {1.0: 1.5, 3.0: 1.0, 10.0: 0.8}  # of the mean deviation, by the window, s
+_STILL_M = 0.1  # position changes below this do not count as motion
 _GAP_S = 3.0  # without fixes, after which the prediction restarts
 _SETTLE_S = 5.0  # until velocity and bias are known
 _BLOCK_S = 1.0
@@ -54,11 +54,7 @@ class MotionVerdict:
 class MotionCheck:
     """Compares fixes with their prediction by the IMU (`track`); in time order, one thread."""
 
-    def __init__(self, config: MotionCheckConfig, track: InertialTrack) -> None:
-        self._config = config
-        self._limits = dict(
-            zip(_WINDOWS_S, (config.limit_1s_m, config.limit_3s_m, config.limit_10s_m), strict=True)
-        )
+    def __init__(self, track: InertialTrack) -> None:
         self._track = track
         self._place = LocalPlace()
         self._moved: InertialDisplacement | None = None
@@ -67,7 +63,7 @@ class MotionCheck:
         self._began_ns = 0
         self._restarts = 0
         self._deviations: deque[tuple[int, float, float, float, float]] = deque(maxlen=1024)
-        self._still = StillPosition(config.still_m)
+        self._still = StillPosition(_STILL_M)
 
     def add(self, fix: VisionFix, *, jumped: bool) -> MotionVerdict:
         """Add a fix that the IMU's record reaches (`ready`). jumped: restart the prediction at this
@@ -129,7 +125,7 @@ class MotionCheck:
     def _largest_deviation(self, now_ns: int) -> tuple[float, float]:
         rows = np.array(self._deviations)
         worst = (0.0, 0.0)
-        for window_s, limit_m in self._limits.items():
+        for window_s, limit_m in _LIMITS_M.items():
             inside = rows[rows[:, 0] > now_ns - window_s * 1e9]
             if len(inside) < _LEAST_FIXES:
                 continue

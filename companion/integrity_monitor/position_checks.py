@@ -7,7 +7,6 @@ from collections import deque
 
 import numpy as np
 
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import CheckResult
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.injection.shadow import gnss_healthy
@@ -15,6 +14,8 @@ from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
+_HEIGHT_M = 8.0  # largest height difference to the barometer
+_RECEIVER_M = 3.0  # largest receiver error that is believed
 _FORGET_S = 120.0  # the barometer's drift against vision: its zero follows with this time
 _MEDIAN_OF = 15
 _BARO_FRESH_NS = 1_000_000_000
@@ -46,8 +47,7 @@ class HeightCheck:
     in this flight, because pressure and temperature change between flights.
     """
 
-    def __init__(self, config: IntegrityMonitorConfig) -> None:
-        self._limit_m = config.height_m
+    def __init__(self) -> None:
         self._zero: float | None = None
         self._altitude_m = 0.0  # that the zero is of
         self._last_ns = 0
@@ -76,7 +76,7 @@ class HeightCheck:
         apart = median - self._zero
         sigma = fix.vertical_sigma_m
         climbed_m = altitude - self._altitude_m
-        bad = abs(apart) > self._limit_m + _SIGMAS * sigma + SENSORS.climb_share * abs(climbed_m)
+        bad = abs(apart) > _HEIGHT_M + _SIGMAS * sigma + SENSORS.climb_share * abs(climbed_m)
         if not bad:
             self._zero += apart * dt / _FORGET_S
             self._altitude_m += climbed_m * dt / _FORGET_S
@@ -85,9 +85,6 @@ class HeightCheck:
 
 class GnssCheck:
     """Compares GNSS with vision in every mode, while GNSS is healthy. Either may be wrong."""
-
-    def __init__(self, config: IntegrityMonitorConfig) -> None:
-        self._cap_m = config.gnss_accuracy_cap_m
 
     def read(
         self, fix: VisionFix, state: VehicleState, protection_m: float, now_ns: int
@@ -103,7 +100,7 @@ class GnssCheck:
         place = LocalPlace()
         place.ned(fix)
         north, east = place.north_east(latitude, longitude)
-        accuracy = VEHICLE_SENSORS.gnss_sigma_m(state.gps_h_accuracy_m, self._cap_m)
+        accuracy = VEHICLE_SENSORS.gnss_sigma_m(state.gps_h_accuracy_m, _RECEIVER_M)
         v_north, v_east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
         later_s = (fix.time_ns - state.gps_time_ns) * 1e-9
         apart = math.hypot(north + v_north * later_s, east + v_east * later_s)

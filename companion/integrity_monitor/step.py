@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 STEP_M = 1.0  # what is less is within any level
+UNREPORTED_JUMP_M = 3.0  # unannounced jumps above this are held
 _MOVES_MPS = 1.0  # below it late stamps explain no step
 _SOON_S = 1.0
 _FIXES = 5  # on either side, whose means are compared
@@ -139,9 +140,7 @@ def _mean(some: Sequence[_Offset]) -> _Offset:
 class StepUncertainty:
     """Sums steps along and across the direction of flight. A step back reduces the sum."""
 
-    def __init__(self, most_m: float) -> None:
-        """most_m: larger steps are jumps, which are held."""
-        self._most_m = most_m
+    def __init__(self) -> None:
         self._finder = StepDetector()
         self._along_m = self._across_m = self._speed = 0.0
 
@@ -153,12 +152,12 @@ class StepUncertainty:
     @property
     def metres(self) -> float:
         """Position uncertainty from steps that lasted, m."""
-        return min(math.hypot(self._along_m, self._across_m), self._most_m)
+        return min(math.hypot(self._along_m, self._across_m), UNREPORTED_JUMP_M)
 
     @property
     def possible_m(self) -> float:
         """As `metres`, with the newest step included before it has lasted."""
-        return min(self.metres + self._finder.suspected_m, self._most_m)
+        return min(self.metres + self._finder.suspected_m, UNREPORTED_JUMP_M)
 
     def add(self, step: PositionStep) -> PositionStep | None:
         """Add the offset of a fix that the jump check passed, sent or not. Returns a step that has

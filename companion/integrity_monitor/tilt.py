@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import math
 
-from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.step import UNREPORTED_JUMP_M
+from localizer.sensors.error_model import SENSORS
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, VisionFix
 
 _SIGMAS, _CALM_SIGMAS = 3.0, 2.0
+# Roll and pitch of gimbal and autopilot with mounting, an axis.
+_SIGMA_RAD = math.radians(SENSORS.mounted_tilt_deg)
+# What is larger is a jump, and held; a gimbal that was knocked costs no more.
+_MOST_M = UNREPORTED_JUMP_M
 _HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
 
 
@@ -23,10 +28,7 @@ class TiltCheck:
     `begins-denied`) would become part of such a bias.
     """
 
-    def __init__(self, config: IntegrityMonitorConfig) -> None:
-        self._sigma_rad = math.radians(config.tilt_deg)
-        # What is larger is a jump, and held; a gimbal that was knocked costs no more.
-        self._most_m = config.unreported_jump_m
+    def __init__(self) -> None:
         self._off_rad = 0.0
         self._share = 0.0  # of its sigma
         self._checked_ns: int | None = None
@@ -44,12 +46,12 @@ class TiltCheck:
 
     def metres(self, height_m: float | None) -> float:
         """Position error from the tilt, m: tilt times height above the ground; 0 below 2 sigma of
-        the tilt, all of it above 3 sigma. At most a jump (`unreported_jump_m`), as for unknown
+        the tilt, all of it above 3 sigma. At most a jump (`UNREPORTED_JUMP_M`), as for unknown
         height (None).
         """
         believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
-        shift_m = self._most_m if height_m is None else height_m * self._off_rad
-        return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
+        shift_m = _MOST_M if height_m is None else height_m * self._off_rad
+        return min(shift_m * min(max(believed, 0.0), 1.0), _MOST_M)
 
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
         """Add a fix. attitude: the autopilot's at its time, None if unknown."""
@@ -59,7 +61,7 @@ class TiltCheck:
             return
         self._checked_ns, self.is_known = fix.time_ns, True
         self._off_rad = math.dist(_level(fix.quaternion), _level(attitude.quaternion))
-        self._share = self._off_rad / math.hypot(self._sigma_rad, fix.attitude_sigma_rad)
+        self._share = self._off_rad / math.hypot(_SIGMA_RAD, fix.attitude_sigma_rad)
         self.tilts = self._share > (_CALM_SIGMAS if self.tilts else _SIGMAS)
 
 

@@ -18,11 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.integrity_monitor.config import VideoCheckConfig
 from localizer.types import Image
 
 Thumbnail = NDArray[np.float32]
 WIDTH, HEIGHT = 64, 48  # of a thumbnail
+STILL_SHARE = 3e-4  # motion below which a frame is frozen, as a share of its width
+REPEAT_S = 2.0  # length of a repetition that is reported
+LOW_DETAIL = 2.0  # `FrameVerdict.detail` that is too low; refusals begin below it (real.md)
+_REPEAT_MEMORY_S = 60.0  # time over which repetition is searched
 _BLOCK = 4
 _CRC_ROWS = 8  # every eighth row is enough to tell two pictures of a sensor apart
 _UNLIKE_GRAY = 2.0  # root mean square difference beyond which a fit need not be tried
@@ -81,13 +84,12 @@ def _seen_frame(time_ns: int, image: Image) -> _SeenFrame:
 class FrozenVideoDetector:
     """Detects frozen and repeated video. Takes as many frames as possible; one thread."""
 
-    def __init__(self, config: VideoCheckConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._reference: _SeenFrame | None = None
         self._newest: _SeenFrame | None = None
         self._identical_since_ns = 0
         self._last_shares: deque[float] = deque(maxlen=_MEDIAN_OF)
-        self._loop = RepeatedVideoDetector(config)
+        self._loop = RepeatedVideoDetector()
 
     def add(self, time_ns: int, image: Image) -> FrameVerdict:
         """Add a frame (H, W, 3) uint8 RGB at its exposure time; returns the result."""
@@ -115,7 +117,7 @@ class FrozenVideoDetector:
             return
         self._last_shares.append(shift_between(self._reference, seen))
         shares = sorted(self._last_shares)
-        if shares[len(shares) // 2] > self._config.still_share:
+        if shares[len(shares) // 2] > STILL_SHARE:
             self._reference = seen
             self._last_shares.clear()
 
@@ -123,9 +125,8 @@ class FrozenVideoDetector:
 class RepeatedVideoDetector:
     """Detects frames that repeat earlier ones at a constant lag, while the image moves."""
 
-    def __init__(self, config: VideoCheckConfig) -> None:
-        self._config = config
-        self._hold_ns = int(config.repeat_s * 1e9)
+    def __init__(self) -> None:
+        self._hold_ns = int(REPEAT_S * 1e9)
         self._memory: deque[_SeenFrame] = deque()
         self._matches: deque[tuple[int, int]] = deque()  # time and lag
 
@@ -133,7 +134,7 @@ class RepeatedVideoDetector:
         """Add a frame; returns the lag of repeated frames, s, or 0 for new frames."""
         before = [old for old in self._memory if seen.time_ns - old.time_ns >= self._hold_ns]
         for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: difference_gray(old, seen)):
-            if shift_between(old, seen) < self._config.still_share:
+            if shift_between(old, seen) < STILL_SHARE:
                 self._matches.append((seen.time_ns, seen.time_ns - old.time_ns))
         while self._matches and seen.time_ns - self._matches[0][0] > self._hold_ns:
             self._matches.popleft()
@@ -151,13 +152,13 @@ class RepeatedVideoDetector:
             return 0.0
         path = [old for old in self._memory if old.time_ns >= times[0]]
         far = max(shift_between(path[0], other) for other in path)
-        return lag_ns * 1e-9 if far > _MOVES * self._config.still_share else 0.0
+        return lag_ns * 1e-9 if far > _MOVES * STILL_SHARE else 0.0
 
     def _remember(self, seen: _SeenFrame) -> None:
         if self._memory and seen.time_ns - self._memory[-1].time_ns < _MEMORY_STEP_NS:
             return
         self._memory.append(seen)
-        oldest_ns = seen.time_ns - int(self._config.repeat_memory_s * 1e9)
+        oldest_ns = seen.time_ns - int(_REPEAT_MEMORY_S * 1e9)
         while self._memory[0].time_ns < oldest_ns:
             self._memory.popleft()
 

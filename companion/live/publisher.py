@@ -144,7 +144,7 @@ class Publisher:
             self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
         if self._consoles and now >= self._next_state_s:
             self._next_state_s = now + _STATE_S
-            for console in self._idle():
+            for console in [c for c in self._consoles.values() if c.is_idle]:
                 head, last_event = self._data.state(console.last_event)
                 if self._begin_send(console, encode(head)):
                     console.last_event = last_event
@@ -153,9 +153,6 @@ class Publisher:
             self._pictures.mark_sent(now)
             for console in ready:
                 self._show(console, shot)
-
-    def _idle(self) -> list[_Console]:
-        return [c for c in self._consoles.values() if c.is_idle]
 
     def _accept(self, listening: Any, _: int) -> None:
         try:

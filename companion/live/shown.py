@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.live.machine import MachineLoad
 from companion.targets.target_manager import TargetEstimate
+from companion.writing import json_value
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
@@ -154,7 +155,7 @@ class ConsoleData:
                 for n, t, level, text in events
             ],
         }
-        plain: dict[str, Any] = _json_value(document)
+        plain: dict[str, Any] = json_value(document)
         return plain, count
 
     def take_frame(self) -> ConsoleFrame | None:
@@ -184,14 +185,14 @@ class ConsoleData:
         parts = [image]
         if estimate is not None:
             head["estimate"] = self._position(estimate) | {
-                "pose": _pose(estimate.world_from_camera)
+                "pose": pose_data(estimate.world_from_camera)
             }
             if view is not None and estimate.accepted:
                 head["view"] = {
-                    "camera": view.camera.to_dict(), "pose": _pose(view.world_from_camera)
+                    "camera": view.camera.to_dict(), "pose": pose_data(view.world_from_camera)
                 }  # fmt: skip
                 parts += [view.rgb, view.depth]
-        return ConsoleFrame(_json_value(head), tuple(parts))
+        return ConsoleFrame(json_value(head), tuple(parts))
 
     def _is_unlocalized(self) -> bool:
         newest = self._estimate
@@ -255,7 +256,8 @@ class ConsoleData:
         }
 
 
-def _pose(pose: Pose) -> dict[str, list[float]]:
+def pose_data(pose: Pose) -> dict[str, list[float]]:
+    """A pose as JSON data: quaternion (w, x, y, z) and translation, m."""
     return {
         "q": [float(x) for x in quaternion_from_matrix(pose.rotation)],
         "t": [float(x) for x in pose.translation],
@@ -268,21 +270,6 @@ def _downscaled(image: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(image)
     size = (_WIDEST, round(height * _WIDEST / width))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-
-
-def _json_value(value: Any) -> Any:
-    """As JSON's own types; NaN and infinity become None."""
-    if isinstance(value, dict):
-        return {str(k): _json_value(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_value(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    return str(value)
 
 
 def _follows(verdict: LoopVerdict) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def replay(
         record.tables.flown_map.require_frame(cache)
         arm = np.array(config.camera.lever_arm_m)
         extrinsics = CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
-        pose = AutopilotPose(autopilot, extrinsics, config.prior)
+        pose = AutopilotPose(autopilot, extrinsics)
         localizer = build_localizer(stack, camera, config.localizer, pose.sensors)
         frames, unzoomed = [], 0
         for one, recorded in zip(record.flight.frames, record.estimates, strict=True):

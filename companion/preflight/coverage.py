@@ -12,7 +12,7 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.preflight.doctor import DoctorFinding
+from mavlink_bridge.preflight.rules import DoctorFinding
 from mavlink_bridge.vehicle.mission import MissionWaypoint
 
 _STEP_M = 25.0

@@ -26,8 +26,9 @@ from localizer.map.inspection.kind import map_kind
 from localizer.map.kind import MapKind
 from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
-from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding, examine
+from mavlink_bridge.preflight.doctor import Diagnosis, examine
 from mavlink_bridge.preflight.mission import download_mission
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 _FEED_S = 8.0  # without any picture
 _FEED_ENOUGH_S = 3.0  # of pictures: their rate is known

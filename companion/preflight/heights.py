@@ -10,7 +10,7 @@ from localizer.errors import MapCacheError
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.preflight.doctor import DoctorFinding
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 _FIX_3D = 3
 _GEOID_ADVICE_M, _GEOID_LIMIT_M = 3.0, 10.0  # receivers hold coarse grids of the geoid

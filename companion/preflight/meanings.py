@@ -7,7 +7,7 @@ import socket
 
 from companion.config import CompanionConfig
 from companion.targets.detections import parse_host_port
-from mavlink_bridge.preflight.doctor import DoctorFinding
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 _LONGEST_ARM_M = 2.0  # of most aircraft that carry this
 _WIDEST_DEG = 125.0  # beyond it Brown's model is no lens's

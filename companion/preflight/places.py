@@ -8,7 +8,7 @@ from pathlib import Path
 from companion.config import CompanionConfig
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.signing import load_key
-from mavlink_bridge.preflight.doctor import DoctorFinding
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 
 def check_places(config: CompanionConfig) -> list[DoctorFinding]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timezone
 from html import escape
@@ -19,7 +18,8 @@ from localizer.errors import LocalizerError
 from localizer.geometry.antimeridian import geo_box
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
-from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
+from mavlink_bridge.preflight.doctor import Diagnosis
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 _OLD_SHADOW_DAYS = 7
 WHEN_VISION_ENDS = (
@@ -244,7 +244,7 @@ def as_html(sheet: PreflightSheet) -> str:
     facts = "".join(row(_mark(r.good), r.name, r.text) for r in sheet.rows)
     ends = "".join(f"<tr><td>{escape(a)}</td><td>{escape(b)}</td></tr>"
                    for a, b in WHEN_VISION_ENDS)  # fmt: skip
-    found = "".join(_found(f) for f in _wrong_first(sheet.findings))
+    found = "".join(map(_found, sorted(sheet.findings, key=lambda f: (f.ok, not f.required))))
     title = f"Before the flight: {_title(sheet)}"
     style = "" if sheet.fit else ' class="no"'
     when = f"{escape(sheet.deployment)} · {sheet.day.strftime('%Y-%m-%d %H:%M UTC')}"
@@ -257,10 +257,6 @@ def as_html(sheet: PreflightSheet) -> str:
         '<div class="sign"><span>Pilot (name, signature)</span><span>Place</span>'
         "<span>Time, UTC</span></div></html>\n"
     )
-
-
-def _wrong_first(findings: Sequence[DoctorFinding]) -> list[DoctorFinding]:
-    return sorted(findings, key=lambda f: (f.ok, not f.required))
 
 
 def _found(finding: DoctorFinding) -> str:

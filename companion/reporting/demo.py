@@ -34,7 +34,7 @@ from companion.reporting.record import (
     worst_frames,
 )
 from companion.reporting.record import uncertainty_plots as uncertainty
-from companion.reporting.verdicts import advice, value_and_limit
+from companion.reporting.verdicts import criterion_result
 from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
 
@@ -138,16 +138,10 @@ def _errors(estimates: Columns, truth: Columns) -> dict[str, np.ndarray]:
 
 
 def _verdicts(report: Mapping[str, Any]) -> tuple[CriterionResult, ...]:
-    verdicts = []
-    for c in report["criteria"]:
-        value, known = c["value"], advice(c["name"])
-        missing = value is None or not np.isfinite(value)
-        ok = not missing and (value >= c["limit"] if c["at_least"] else value <= c["limit"])
-        found, needed = value_and_limit(value, c["limit"], c["unit"], at_least=c["at_least"])
-        verdicts.append(
-            CriterionResult(c["name"], found, needed, bool(ok), known.meaning, known.look)
-        )
-    return tuple(verdicts)
+    return tuple(
+        criterion_result(c["name"], c["value"], c["limit"], c["unit"], at_least=c["at_least"])
+        for c in report["criteria"]
+    )
 
 
 def _plots(

@@ -21,7 +21,7 @@ from companion.reporting.content import (
 )
 from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import VISION
-from companion.reporting.verdicts import advice, value_and_limit
+from companion.reporting.verdicts import criterion_result
 from companion.sources.folder_source import read_image
 from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
@@ -70,18 +70,12 @@ def evaluation_report(folder: Path, say: Say = silent) -> Report:
 
 def _verdicts(document: dict[str, float]) -> tuple[CriterionResult, ...]:
     """Criteria with the same limits as for a demo flight's localizer."""
-    wanted = (
-        ("localizer median", document["median_translation_m"], 1.0, "m", False),
-        ("localizer R@3", document["recall_3"], 95.0, "%", True),
-        ("completeness", document["completeness"], 99.0, "%", True),
+    median = document["median_translation_m"]
+    return (
+        criterion_result("localizer median", median, 1.0, "m", at_least=False),
+        criterion_result("localizer R@3", document["recall_3"], 95.0, "%", at_least=True),
+        criterion_result("completeness", document["completeness"], 99.0, "%", at_least=True),
     )
-    verdicts = []
-    for name, value, limit, unit, at_least in wanted:
-        ok = value is not None and (value >= limit if at_least else value <= limit)
-        known = advice(name)
-        found, needed = value_and_limit(value, limit, unit, at_least=at_least)
-        verdicts.append(CriterionResult(name, found, needed, bool(ok), known.meaning, known.look))
-    return tuple(verdicts)
 
 
 def _first_fault(frames: dict[str, np.ndarray], accepted: np.ndarray, position: np.ndarray) -> str:

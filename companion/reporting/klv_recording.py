@@ -10,7 +10,6 @@ from pathlib import Path
 
 import av
 import numpy as np
-from av.sidedata.sidedata import Type as SideDataType
 
 from companion.errors import RecordError, StreamOpenError
 from companion.klv.local_set import encode
@@ -19,7 +18,7 @@ from companion.klv.transport import TransportWriter
 from companion.offline.record import RecordTables, read_record
 from companion.offline.tables import Columns, poses
 from companion.sources.base import fitted_camera, has_times, video_stream
-from companion.sources.misp import parse_message
+from companion.sources.misp import misp_time
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler
 from localizer.map.cache.cache import TileCache
@@ -123,12 +122,8 @@ class _Clock:
         self.first = pts if self.first is None else self.first
         if self.begin_ns is not None:
             return self.begin_ns + round((pts - self.first) * 10**9)
-        for data in picture.side_data:
-            if data.type == SideDataType.SEI_UNREGISTERED:
-                stamp = parse_message(bytes(data))
-                if stamp is not None:
-                    return stamp.time_us * 1000 - self.utc_minus_monotonic_ns
-        return None
+        stamp = misp_time(picture)
+        return None if stamp is None else stamp.time_us * 1000 - self.utc_minus_monotonic_ns
 
 
 def _packets(

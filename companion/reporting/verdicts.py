@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from companion.reporting.content import CriterionResult
+
 
 @dataclass(frozen=True)
 class Advice:
@@ -82,3 +84,14 @@ def value_and_limit(
 def advice(name: str) -> Advice:
     """Explanation of the criterion whose name begins with a known one; otherwise a general one."""
     return next((a for begin, a in _ADVICE.items() if name.startswith(begin)), _UNKNOWN)
+
+
+def criterion_result(
+    name: str, value: float | None, limit: float, unit: str, *, at_least: bool
+) -> CriterionResult:
+    """Compare a value, None if it is not known, with its limit."""
+    known = advice(name)
+    found, needed = value_and_limit(value, limit, unit, at_least=at_least)
+    figure = math.nan if value is None else value  # which meets no limit
+    ok = math.isfinite(figure) and (figure >= limit if at_least else figure <= limit)
+    return CriterionResult(name, found, needed, ok, known.meaning, known.look)

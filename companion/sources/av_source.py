@@ -14,7 +14,6 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from av.sidedata.sidedata import Type as SideDataType
 from av.video.frame import PictureType
 
 from companion.errors import (
@@ -28,13 +27,13 @@ from companion.redaction import redacted
 from companion.sources.base import (
     GREY_RANGE_ADVICE,
     PacketTap,
+    ReportingSource,
     SourceCounters,
     SourceSettings,
     StateCallback,
     StreamState,
     fitted_camera,
     has_times,
-    scaling_text,
     video_stream,
 )
 from companion.sources.datagrams import (
@@ -43,7 +42,7 @@ from companion.sources.datagrams import (
     UdpAddress,
     VideoDatagrams,
 )
-from companion.sources.misp import MispTime, parse_message
+from companion.sources.misp import misp_time
 from companion.sources.references import DamageTracker, ReferenceTracker
 from companion.sources.sdp import SdpSession
 from companion.sources.timing import ExposureClock, FrameTimestamps
@@ -154,7 +153,7 @@ class VideoDecoder:
         self._container.close()
 
 
-class VideoFileSource:
+class VideoFileSource(ReportingSource):
     """Every frame of a video file. Exposure time: start of `frames` plus time since the first
     frame.
     """
@@ -169,14 +168,11 @@ class VideoFileSource:
     ) -> None:
         if not path.is_file():
             raise StreamOpenError(f"{path}: no such video file")
+        super().__init__(camera, settings, on_state)
         self._path = path
-        self._camera = camera
-        self._settings = settings or SourceSettings()
-        self._on_state = on_state
         self._tap = tap
         self._closed = threading.Event()
         self._counters = SourceCounters()
-        self._state = StreamState.IDLE
         self._rgb = _ToRgb(self._settings.grey_range)
         self._rate_hz: float | None = None  # of a file without times
 
@@ -184,11 +180,6 @@ class VideoFileSource:
     def counters(self) -> SourceCounters:
         """Counters so far; `dropped` stays 0."""
         return self._counters
-
-    @property
-    def state(self) -> StreamState:
-        """Idle, live, scaled, ended, failed or closed."""
-        return self._state
 
     def frames(self) -> Iterator[Frame]:
         """Every frame, with `realtime` at the times recorded. `StreamOpenError` for no video,
@@ -220,7 +211,7 @@ class VideoFileSource:
         first: int | None = None
         for picture in self._readable(decoder):
             camera = self._rgb.camera(picture, self._camera, str(self._path))
-            self._report_scaling(camera)
+            self._report_scaling(camera, str(self._path))
             pts = self._pts_ns(picture, decoder)
             first = pts if first is None else first
             offset = pts - first
@@ -252,11 +243,6 @@ class VideoFileSource:
         _log.warning("%s: %s", self._path, text)
         return text
 
-    def _report_scaling(self, camera: Camera) -> None:
-        if camera is not self._camera and self._state is not StreamState.SCALED:
-            text = scaling_text(camera.width, camera.height, self._camera, str(self._path))
-            self._report(StreamState.SCALED, text)
-
     def _readable(self, decoder: VideoDecoder) -> Iterator[av.VideoFrame]:
         try:
             for picture, _ in decoder.pictures():
@@ -284,13 +270,8 @@ class VideoFileSource:
         rate = self._rate_hz or float(decoder.stream.average_rate or self._settings.rate_hz)
         return round(self._delivered * 1e9 / rate)
 
-    def _report(self, state: StreamState, text: str) -> None:
-        self._state = state
-        if self._on_state is not None:
-            self._on_state(state, text)
 
-
-class LiveVideoSource:
+class LiveVideoSource(ReportingSource):
     """Decodes a live stream in a reader thread, which keeps only the newest frame. If the stream
     stops, the state becomes STALLED and the reader connects again, with longer waits after
     failures.
@@ -307,18 +288,15 @@ class LiveVideoSource:
         on_stranger: Callable[[str], None] | None = None,
         tap: PacketTap | None = None,
     ) -> None:
+        super().__init__(camera, settings, on_state)
         self._tap, self._on_stranger = tap, on_stranger
         self._location = redacted(location)
-        self._camera = camera
-        self._settings = settings or SourceSettings()
         self._input = live_input(location, camera, self._settings, self._stranger)
-        self._on_state = on_state
         self._newest: Mailbox[tuple[av.VideoFrame, Camera, int, int]] = Mailbox()
         self._closing = threading.Event()
         self._reader: threading.Thread | None = None
         self._lock = threading.Lock()
         self._counters = SourceCounters()
-        self._state = StreamState.IDLE
         self._last_picture_ns = 0
         self._rgb = _ToRgb(self._settings.grey_range)
 
@@ -329,11 +307,6 @@ class LiveVideoSource:
             datagrams = self._input.datagrams
             foreign = 0 if datagrams is None else datagrams.foreign
             return replace(self._counters, dropped=self._newest.dropped, foreign=foreign)
-
-    @property
-    def state(self) -> StreamState:
-        """State of the stream."""
-        return self._state
 
     def frames(self) -> Iterator[Frame]:
         """Start the reader, wait for the newest frame and yield it; ends only when closed.
@@ -464,18 +437,16 @@ class LiveVideoSource:
         camera = self._fitted(picture)
         if camera is None:
             return
-        stamps = FrameTimestamps(_pts_ns(picture), _misp_time(picture))
+        stamps = FrameTimestamps(_pts_ns(picture), misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns) - self._settings.late_ns
         _pass_exposure_time(self._tap, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile
         self._count(received=1)
-        width, height = camera.width, camera.height
         if camera is self._camera:
-            self._report_change(StreamState.LIVE, f"{self._location}: live, {width}x{height}")
-        else:
-            text = scaling_text(width, height, self._camera, self._location)
-            self._report_change(StreamState.SCALED, text)
+            size = f"{camera.width}x{camera.height}"
+            self._report_change(StreamState.LIVE, f"{self._location}: live, {size}")
+        self._report_scaling(camera, self._location)
 
     def _fitted(self, picture: av.VideoFrame) -> Camera | None:
         """Camera model of the frame's size; None if it does not fit, but before any frame the
@@ -503,14 +474,8 @@ class LiveVideoSource:
     def _report_stall(self, reason: str) -> None:
         self._report_change(StreamState.STALLED, f"{self._location}: {reason}")
 
-    def _report_change(self, state: StreamState, text: str) -> None:
-        if self._state is not state:
-            self._report(state, text)
-
     def _report(self, state: StreamState, text: str) -> None:
-        self._state = state
-        if self._on_state is not None:
-            self._on_state(state, redacted(text))  # FFmpeg's own errors name the whole address
+        super()._report(state, redacted(text))  # FFmpeg's own errors name the whole address
 
 
 def _nothing_came() -> str:
@@ -608,12 +573,3 @@ def _pts_ns(picture: av.VideoFrame) -> int | None:
 def _pass_exposure_time(tap: PacketTap | None, picture: av.VideoFrame, exposure_ns: int) -> None:
     if tap is not None and picture.pts is not None and picture.time_base is not None:
         tap.frame_exposed(Fraction(picture.pts * picture.time_base), exposure_ns)
-
-
-def _misp_time(picture: av.VideoFrame) -> MispTime | None:
-    for data in picture.side_data:
-        if data.type == SideDataType.SEI_UNREGISTERED:
-            stamp = parse_message(bytes(data))
-            if stamp is not None:
-                return stamp
-    return None

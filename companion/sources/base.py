@@ -236,6 +236,37 @@ class FrameSource(Protocol):
         ...
 
 
+class ReportingSource:
+    """What every `FrameSource` has: camera model, settings, and a state that it reports."""
+
+    def __init__(
+        self, camera: Camera, settings: SourceSettings | None, on_state: StateCallback | None
+    ) -> None:
+        self._camera, self._settings = camera, settings or SourceSettings()
+        self._on_state = on_state
+        self._state = StreamState.IDLE
+
+    @property
+    def state(self) -> StreamState:
+        """State of the feed."""
+        return self._state
+
+    def _report(self, state: StreamState, text: str) -> None:
+        self._state = state
+        if self._on_state is not None:
+            self._on_state(state, text)
+
+    def _report_change(self, state: StreamState, text: str) -> None:
+        if self._state is not state:
+            self._report(state, text)
+
+    def _report_scaling(self, camera: Camera, where: str) -> None:
+        """Report if `camera`, the model of a frame, is the calibrated one scaled."""
+        if camera is not self._camera:
+            text = scaling_text(camera.width, camera.height, self._camera, where)
+            self._report_change(StreamState.SCALED, text)
+
+
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
     """Camera model for frames of width x height pixels: the calibrated one, scaled if necessary.
     where: location for the error text. `StreamSizeError` for another aspect ratio.

@@ -13,12 +13,12 @@ import cv2
 from companion.errors import StreamDecodeError, StreamOpenError
 from companion.sources.base import (
     GREY_RANGE_ADVICE,
+    ReportingSource,
     SourceCounters,
     SourceSettings,
     StateCallback,
     StreamState,
     fitted_camera,
-    scaling_text,
 )
 from localizer.errors import GreyRangeError
 from localizer.geometry.camera import Camera
@@ -102,7 +102,7 @@ def exposure_times_of(folder: Path, images: Sequence[Path]) -> tuple[int, ...] |
     return tuple(by_name[path.name] for path in images)
 
 
-class FolderSource:
+class FolderSource(ReportingSource):
     """Frames from the images of a folder (`StreamOpenError` without any). Exposure times (ns) are
     those of ``timestamps.txt``; without that file, they begin when `frames` does and follow at
     `rate_hz`. With `realtime`, recorded times are shifted to begin then.
@@ -115,25 +115,17 @@ class FolderSource:
         settings: SourceSettings | None = None,
         on_state: StateCallback | None = None,
     ) -> None:
+        super().__init__(camera, settings, on_state)
         self._folder = folder
-        self._camera = camera
-        self._settings = settings or SourceSettings()
-        self._on_state = on_state
         self._images = list_images(folder)
         self._times = exposure_times_of(folder, self._images)
         self._closed = threading.Event()
-        self._state = StreamState.IDLE
         self._delivered = 0
 
     @property
     def counters(self) -> SourceCounters:
         """Counters so far; `dropped` stays 0."""
         return SourceCounters(received=self._delivered, delivered=self._delivered)
-
-    @property
-    def state(self) -> StreamState:
-        """Idle, live, scaled, ended, failed or closed."""
-        return self._state
 
     def frames(self) -> Iterator[Frame]:
         """Every image; raises `StreamDecodeError` or `StreamSizeError`, which name the file."""
@@ -165,20 +157,13 @@ class FolderSource:
         except Exception as error:
             self._report(StreamState.FAILED, str(error))
             raise
-        if camera is not self._camera and self._state is not StreamState.SCALED:
-            text = scaling_text(width, height, self._camera, str(path))
-            self._report(StreamState.SCALED, text)
+        self._report_scaling(camera, str(path))
         return Frame(image, time_ns, camera, sequence)
 
     def _offset_ns(self, sequence: int, first: int) -> int:
         if self._times:
             return self._times[sequence] - first
         return round(sequence * 1e9 / self._settings.rate_hz)
-
-    def _report(self, state: StreamState, text: str) -> None:
-        self._state = state
-        if self._on_state is not None:
-            self._on_state(state, text)
 
 
 def _natural_key(path: Path) -> list[tuple[int, str]]:

@@ -10,6 +10,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import av
+from av.sidedata.sidedata import Type as SideDataType
+
 UUID = b"MISPmicrosectime"
 _NOT_LOCKED = 0x80  # status bit 7: 0 = the clock is locked to an absolute reference
 _STATUS_RESERVED = 0x1F  # status bits 0 to 4 are reserved and always 1
@@ -43,3 +46,9 @@ def parse_message(message: bytes) -> MispTime | None:
         return None
     t = body[1:3] + body[4:6] + body[7:9] + body[10:12]
     return MispTime(int.from_bytes(t, "big"), locked=not body[0] & _NOT_LOCKED)
+
+
+def misp_time(picture: av.VideoFrame) -> MispTime | None:
+    """The time stamp in a decoded frame; None without one."""
+    messages = (d for d in picture.side_data if d.type == SideDataType.SEI_UNREGISTERED)
+    return next(filter(None, (parse_message(bytes(data)) for data in messages)), None)

@@ -134,7 +134,8 @@ class TargetReporter:
                 newest = self._estimates[-1] if self._estimates else None
                 pictures = self._take_pictures()
             for estimate, frame in pictures:
-                self._guarded(self._population.add_image, estimate, _gray(frame))
+                gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+                self._guarded(self._population.add_image, estimate, gray)
             for click in clicks:
                 if not self._guarded(self._population.begin, click):
                     self._report_alert(alert(AlertId.TARGET_UNREADABLE, number=click.number))
@@ -198,7 +199,3 @@ class TargetReporter:
             if estimate.exposure_time_ns < detection.time_ns:
                 return None  # older ones are farther from it
         return None
-
-
-def _gray(frame: Frame) -> Any:
-    return cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)

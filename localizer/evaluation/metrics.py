@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,10 +28,6 @@ class LocalizationMetrics:
     p95_rotation_deg: float | None = None
     max_translation_m: float | None = None
     max_rotation_deg: float | None = None
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """JSON data; a median without frames is null."""
-        return asdict(self)
 
 
 def localization_metrics(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from localizer.features.extractor import DeviceExtractor, FeatureExtractor
+from localizer.features.extractor import FeatureExtractor
 from localizer.types import FeatureLevel, FeaturePyramid, Image
 
 _SMOOTH_PX = 0.8  # a rendered texture and a photo differ in their last half pixel
@@ -31,17 +31,6 @@ class DetailExtractor:
     def name(self) -> str:
         """What computes the features, for reports."""
         return f"{self._base.name} + detail"
-
-    def extract_on_device(self, rgb: Image) -> FeaturePyramid:
-        """As `extract`; the levels of the other extractor stay on the GPU if it computes there.
-
-        The detail level is computed on the CPU and is in host memory.
-        """
-        if isinstance(self._base, DeviceExtractor):
-            pyramid = self._base.extract_on_device(rgb)
-        else:
-            pyramid = self._base.extract(rgb)
-        return FeaturePyramid((*pyramid.levels, detail_level(rgb)), pyramid.width, pyramid.height)
 
     def extract(self, rgb: Image) -> FeaturePyramid:
         """Pyramid of an (H, W, 3) uint8 RGB image; the last level has stride 1."""

@@ -11,14 +11,13 @@ from __future__ import annotations
 import hashlib
 import logging
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 import onnxruntime as ort
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from localizer.errors import ModelError
-from localizer.features.bound_session import BoundSession
 from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
 from localizer.features.openvino_session import PROVIDER as OPENVINO
@@ -43,16 +42,6 @@ class FeatureExtractor(Protocol):
     def extract(self, rgb: Image) -> FeaturePyramid:
         """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by 8 (`ModelError` otherwise).
         Several threads may call it at a time.
-        """
-
-
-@runtime_checkable
-class DeviceExtractor(Protocol):
-    """An extractor that can leave its features on the GPU."""
-
-    def extract_on_device(self, rgb: Image) -> FeaturePyramid:
-        """As `FeatureExtractor.extract`, with `DeviceArray`s where the network runs on a GPU. They
-        are valid until the next call.
         """
 
 
@@ -117,9 +106,8 @@ class OnnxExtractor:
     """A network in onnxruntime, on the best execution provider that works.
 
     size: width and height of the images to come, for the warm-up. half: TensorRT may compute in
-    float16. only: TensorRT, CUDA or CPU, instead of the best. bound_to: onnxruntime's name of the
-    device where `extract_on_device` leaves its outputs; None: the provider's. finest: levels of a
-    smaller stride are not computed.
+    float16. only: TensorRT, CUDA or CPU, instead of the best. finest: levels of a smaller stride
+    are not computed.
     """
 
     def __init__(
@@ -130,7 +118,6 @@ class OnnxExtractor:
         size: tuple[int, int] | None = None,
         half: bool = False,
         only: str | None = None,
-        bound_to: str | None = None,
         finest: int = 1,
     ) -> None:
         self.info = read_model_info(model)
@@ -159,9 +146,6 @@ class OnnxExtractor:
             lambda session: self._check(session, model, width, height),
             only,
         )
-        on_gpu = self.provider not in ("CPU", OPENVINO)
-        device = bound_to or ("cuda" if on_gpu else None)
-        self._bound = None if device is None else BoundSession(self._session, self._outputs, device)
         _log.info("features: %s", self.name)
 
     @property
@@ -187,24 +171,6 @@ class OnnxExtractor:
             FeatureLevel(arrays[2 * k][0], arrays[2 * k + 1][0], level.stride)
             for k, level in enumerate(self._levels)
         )
-
-    def extract_on_device(self, rgb: Image) -> FeaturePyramid:
-        """As `extract`, without the copy to the host; on a CPU it is `extract`."""
-        if self._bound is None:
-            return self.extract(rgb)
-        check_image(rgb, self._multiple)
-        arrays = self._bound.run(np.ascontiguousarray(rgb)[None])
-        levels = []
-        for k, level in enumerate(self._levels):
-            features, confidence = arrays[2 * k], arrays[2 * k + 1]
-            levels.append(
-                FeatureLevel(
-                    features.reshaped(*features.shape[1:]),  # type: ignore[arg-type]
-                    confidence.reshaped(*confidence.shape[1:]),  # type: ignore[arg-type]
-                    level.stride,
-                )
-            )
-        return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
     def _check(self, session: Session, model: Path, width: int, height: int) -> None:
         """Run the network once, to warm it up and to detect a wrong graph now, not in flight."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-6  # rad; below it Taylor series are exact to float64
+_SINGULAR = 1e-9  # least eigenvalue of a scaled matrix that has an inverse
 
 
 def hat(v: ArrayLike) -> Array:
@@ -107,6 +108,21 @@ def euler_from_matrix(R: ArrayLike) -> tuple[float, float, float]:
         float(np.arcsin(np.clip(-R[2, 0], -1.0, 1.0))),
         float(np.arctan2(R[1, 0], R[0, 0])),
     )
+
+
+def scaled_inverse(matrix: Array) -> Array | None:
+    """Inverse of a positive definite matrix with rows of any units (m, rad), such as normal
+    equations; None if it is singular.
+    """
+    diagonal = np.diag(matrix)
+    if not np.all(diagonal > 0):
+        return None
+    spread = 1.0 / np.sqrt(diagonal)
+    scaled = matrix * np.outer(spread, spread)
+    if np.linalg.eigvalsh(scaled)[0] < _SINGULAR:
+        return None
+    inverse: Array = np.linalg.inv(scaled) * np.outer(spread, spread)
+    return inverse
 
 
 @dataclass(frozen=True)

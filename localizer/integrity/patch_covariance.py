@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localizer.geometry.pose import Array
+from localizer.geometry.pose import Array, scaled_inverse
 from localizer.registration.agreement import PatchDisplacements
 
 LEAST_PATCHES = 8  # six numbers are fitted
@@ -21,7 +21,6 @@ _LEAST_PX = 0.05  # of the scatter: a perfect fit is no perfect knowledge
 # Both were chosen on fengyuan, with a look at NEON and caliterra; no other town has checked them.
 BLOCK_M = 20.0  # over which an unknown height is the same: a building, a row of trees
 COMMON = 2.0  # mean of the unknown heights over their spread: buildings stand on the ground
-_SINGULAR = 1e-9
 
 
 def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Array | None:
@@ -34,11 +33,8 @@ def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Arra
         return None
     rows = patches.motion.reshape(-1, 6)
     normal = rows.T @ rows
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal * np.outer(scale, scale)
-    if np.linalg.eigvalsh(scaled)[0] < _SINGULAR:
+    if (inverse := scaled_inverse(normal)) is None:
         return None
-    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     noise_px = max(patches.scatter_px, _LEAST_PX)
     meat = noise_px**2 * normal
     if height_sigma_m > 0:

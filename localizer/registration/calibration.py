@@ -10,12 +10,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, scaled_inverse
 from localizer.geometry.shutter import Sweep
 from localizer.sensors.error_model import SENSORS
 
 _POINTS = 400  # enough for a mean
-_LEAST_EIGENVALUE = 1e-9  # of the scaled normal equations, below which no pose is determined
 
 
 class CalibrationSigmas(BaseModel):
@@ -71,12 +70,8 @@ def calibration_covariance(
     J = _pixel_motion(points, pose, camera)
     shifts = _pixel_shifts(sigmas, points, pixels, pose, camera, sweep)
     rows = J.reshape(-1, 6)
-    normal = rows.T @ rows
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal * np.outer(scale, scale)
-    if np.linalg.eigvalsh(scaled)[0] < _LEAST_EIGENVALUE:
+    if (inverse := scaled_inverse(rows.T @ rows)) is None:
         return late
-    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     effects = inverse @ (rows.T @ shifts.reshape(len(rows), -1))
     displaced = inverse @ _displacement(sigmas, J, camera) @ inverse
     covariance: Array = effects @ effects.T + displaced + late

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, scaled_inverse
 from localizer.registration.backend import LevelProblem, LMSettings
 from localizer.registration.cpu.reference import (
     in_view,
@@ -186,7 +186,7 @@ def sandwich_covariance(
     channels and within an image cell, come from the data. A prior adds noise of its own, by its
     weight `prior_weight`.
     """
-    inverse = _inverse(sums.curvature * sums.hessian + sums.prior_hessian)
+    inverse = scaled_inverse(sums.curvature * sums.hessian + sums.prior_hessian)
     if inverse is None or sums.cells <= 6:
         return None
     factor = noise.correlation * sums.share * (1.0 + noise.few_anchors / max(sums.anchors, 1))
@@ -201,24 +201,11 @@ def sandwich_covariance(
     return symmetric
 
 
-def _inverse(matrix: Array) -> Array | None:
-    """Inverse of a positive definite matrix with rows of any units; None if it is singular."""
-    diagonal = np.diag(matrix)
-    if not np.all(diagonal > 0):
-        return None
-    spread = 1.0 / np.sqrt(diagonal)
-    scaled = matrix * np.outer(spread, spread)
-    if np.linalg.eigvalsh(scaled)[0] < 1e-9:
-        return None
-    inverse: Array = np.linalg.inv(scaled) * np.outer(spread, spread)
-    return inverse
-
-
 def _shrunk_meat(sums: CovarianceSums, shape_cells: float) -> Array:
     """Equation 11c: the meat, drawn towards the isotropic model of the same size."""
     freedom = sums.cells - 6
     meat = sums.meat * (sums.cells / freedom)
-    shape = _inverse(sums.isotropic)
+    shape = scaled_inverse(sums.isotropic)
     if shape is None:
         return meat
     ratio = float(np.einsum("ij,ji->", shape, meat)) / 6
@@ -230,7 +217,7 @@ def _map_displacement(sums: CovarianceSums, map_error: float) -> Array | None:
     """Equation 11d: covariance (6, 6) of xi by displaced patches of the map; None if the anchors do
     not determine a pose.
     """
-    inverse = _inverse(sums.motion)
+    inverse = scaled_inverse(sums.motion)
     if inverse is None:
         return None
     px_per_m = np.sqrt(0.5 * (sums.motion[0, 0] + sums.motion[1, 1]))

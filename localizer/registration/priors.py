@@ -49,13 +49,6 @@ def height_constraint(height_m: float, sigma_m: float) -> PoseConstraint:
     return PoseConstraint(Pose(np.eye(3), np.array([0.0, 0.0, height_m])), information)
 
 
-def position_constraint(position: Array, covariance: Array) -> PoseConstraint:
-    """The camera's world position (3,), m, with covariance (3, 3), for example dead reckoning."""
-    information = np.zeros((6, 6))
-    information[:3, :3] = np.linalg.inv(covariance)
-    return PoseConstraint(Pose(np.eye(3), np.asarray(position, dtype=np.float64)), information)
-
-
 def combine(*constraints: PoseConstraint) -> PoseConstraint:
     """One constraint with the sum of the costs, up to a constant.
 

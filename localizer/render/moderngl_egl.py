@@ -90,7 +90,6 @@ class ModernGLRenderer(TileRenderer):
     def __init__(
         self,
         streamer: TileProvider,
-        sky: tuple[int, int, int] = SKY,
         byte_budget: int = 1 << 30,
     ) -> None:
         """Open an EGL context; raises `RenderError` where there is none."""
@@ -103,7 +102,7 @@ class ModernGLRenderer(TileRenderer):
         self.name = f"moderngl ({self.device})"
         self._owner = threading.get_ident()
         self._finish = _gl_finish()
-        self._sky = tuple(c / 255 for c in sky)
+        self._sky = tuple(c / 255 for c in SKY)
         self._budget = byte_budget
         self._program: Any = self._context.program(
             vertex_shader=_VERTEX_SHADER, fragment_shader=_FRAGMENT_SHADER

@@ -51,15 +51,10 @@ class _Prepared:
 class NumbaRenderer(TileRenderer):
     """Draws the tiles of a streamer on the CPU. One thread renders at a time."""
 
-    def __init__(
-        self,
-        streamer: TileProvider,
-        threads: int = 2,
-        sky: tuple[int, int, int] = SKY,
-    ) -> None:
+    def __init__(self, streamer: TileProvider, threads: int = 2) -> None:
         super().__init__(streamer)
         self.name = f"numba (CPU, {threads} threads)"
-        self._sky = np.array(sky, np.uint8)
+        self._sky = np.array(SKY, np.uint8)
         self._threads = threads
         self._pool = ThreadPoolExecutor(threads, "raster") if threads > 1 else None
         self._vertices = np.empty((0, 3), np.float32)

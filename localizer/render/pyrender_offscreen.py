@@ -83,7 +83,7 @@ void main() {
 class PyrenderRenderer(TileRenderer):
     """Draws tiles with pyrender. Only the thread that made it may use it."""
 
-    def __init__(self, streamer: TileProvider, sky: tuple[int, int, int] = SKY) -> None:
+    def __init__(self, streamer: TileProvider) -> None:
         """Open an EGL context; raises `RenderError` where there is none."""
         super().__init__(streamer)
         try:
@@ -97,7 +97,7 @@ class PyrenderRenderer(TileRenderer):
         self._offscreen._renderer = _ExactRenderer(64, 64, str(folder))  # noqa: SLF001
         self.name = "pyrender (OpenGL)"
         self._owner = threading.get_ident()
-        self._sky = (*(c / 255 for c in sky), 0.0)  # alpha 0 marks what nothing was drawn on
+        self._sky = (*(c / 255 for c in SKY), 0.0)  # alpha 0 marks what nothing was drawn on
         self._meshes: OrderedDict[int, tuple[TileMesh, Any]] = OrderedDict()
 
     def draw(

@@ -11,7 +11,7 @@ from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.tile import TileMesh
-from localizer.render.base import SKY, MapRenderer, TileProvider
+from localizer.render.base import MapRenderer, TileProvider
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import RenderedView
 
@@ -46,7 +46,6 @@ def make_renderer(
     streamer: TileProvider,
     *,
     threads: int = 2,
-    sky: tuple[int, int, int] = SKY,
 ) -> MapRenderer:
     """A renderer that one thread makes and uses.
 
@@ -54,17 +53,17 @@ def make_renderer(
     Raises `RenderError` if the asked backend is not available.
     """
     if backend == "numba":
-        return NumbaRenderer(streamer, threads, sky)
+        return NumbaRenderer(streamer, threads)
     if backend == "pyrender":
         try:
             from localizer.render.pyrender_offscreen import PyrenderRenderer
         except ImportError as error:
             raise RenderError(f"pyrender is not installed (extra `pyrender`): {error}") from error
-        return PyrenderRenderer(streamer, sky)
+        return PyrenderRenderer(streamer)
     try:
         from localizer.render.moderngl_egl import ModernGLRenderer
 
-        renderer = ModernGLRenderer(streamer, sky)
+        renderer = ModernGLRenderer(streamer)
     except ImportError as error:
         if backend == "moderngl":
             raise RenderError(f"moderngl is not installed (extra `gpu`): {error}") from error
@@ -78,7 +77,7 @@ def make_renderer(
             return renderer
         _log.info("no GPU renderer: OpenGL runs on the CPU here (%s)", renderer.device)
         renderer.close()
-    return NumbaRenderer(streamer, threads, sky)
+    return NumbaRenderer(streamer, threads)
 
 
 class _OwnedRenderer:

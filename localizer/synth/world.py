@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array
-from localizer.synth.config import BLOCK_M, TOP_M, Variant, VisitLook, WorldConfig, look_of
+from localizer.synth.config import BLOCK_M, TOP_M, Variant, WorldConfig, look_of
 from localizer.synth.plan.layout import plan_world
 from localizer.synth.plan.plan import PlannedTarget, WorldPlan
 from localizer.synth.plan.terrain import River, Terrain
@@ -62,17 +62,12 @@ class WorldInfo:
 
     def save(self, folder: Path) -> None:
         """Write world.json and the terrain grid to an existing folder."""
-        o = self.origin
         document = {
             "format": _FORMAT,
             "seed": self.seed,
             "variant": self.variant,
             "size_m": self.size_m,
-            "origin": {
-                "latitude_deg": o.latitude_deg,
-                "longitude_deg": o.longitude_deg,
-                "height_m": o.height_m,
-            },
+            "origin": asdict(self.origin),
             "geoid_separation_m": self.geoid_separation_m,
             "buildings": self.buildings,
             "terrain_spacing_m": self.terrain.spacing_m,
@@ -129,20 +124,17 @@ def build_world(
     *,
     variant: Variant = "survey",
     size_m: float = 1600.0,
-    config: WorldConfig | None = None,
-    look: VisitLook | None = None,
     processes: int = 2,
 ) -> WorldInfo:
     """Generate a world and write it to the folder `out` as tileset.json, GLB tiles and world.json;
     those already there are deleted first.
 
-    variant: "survey" is what the map shows, "live" the same place at another visit. config, look:
-    replace the defaults of seed, size and variant. processes: number that paint in parallel; more
-    than one needs the usual ``if __name__ == "__main__"`` guard in a script.
+    variant: "survey" is what the map shows, "live" the same place at another visit. processes:
+    number that paint in parallel; more than one needs the usual ``if __name__ == "__main__"`` guard
+    in a script.
     """
-    config = config or WorldConfig(seed, size_m)
-    visit = Visit(variant, look or look_of(variant))
-    return build_visits(config, {Path(out): visit}, processes)[0]
+    visit = Visit(variant, look_of(variant))
+    return build_visits(WorldConfig(seed, size_m), {Path(out): visit}, processes)[0]
 
 
 def build_visits(

@@ -22,6 +22,9 @@ from localizer.targets.foreground import (
     find_object,
     is_detectable,
     is_ground,
+    peak_offset,
+    second_best,
+    squared_share,
 )
 from localizer.targets.standing import StaticAppearance
 from localizer.targets.track import pixel_of
@@ -351,12 +354,6 @@ def _outline(differs: NDArray[np.uint8], half: int) -> NDArray[np.uint8] | None:
     return mask if mask[half - 1 : half + 2, half - 1 : half + 2].any() else None
 
 
-def _squared_share(reach: int) -> Grey:
-    """(2 reach + 1, 2 reach + 1): squared distance from the middle, as a share of the reach's."""
-    line = (np.arange(-reach, reach + 1, dtype=np.float32) / max(reach, 1)) ** 2
-    return np.asarray(line[:, None] + line[None], dtype=np.float32)
-
-
 def _match(
     chart: NDArray[np.float32],
     template: NDArray[np.float32],
@@ -371,16 +368,8 @@ def _match(
     """
     scores = cv2.matchTemplate(chart, template, cv2.TM_CCOEFF_NORMED, mask=mask)
     scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)
-    scores -= aside * _squared_share(reach)
+    scores -= aside * squared_share(reach)
     _, best, _, (x, y) = cv2.minMaxLoc(scores)
-    offset = np.array([x - reach, y - reach], dtype=np.float64)
-    for axis, line, k in ((0, scores[y], x), (1, scores[:, x], y)):
-        if 0 < k < len(line) - 1:
-            a, b, c = (float(v) for v in line[k - 1 : k + 2])
-            bend = a - 2 * b + c
-            offset[axis] += 0.5 * (a - c) / bend if bend < 0 else 0.0
-    near = max(3, (len(template) - 1) // 3)
-    rivals = scores.copy()
-    rivals[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = -1.0
-    second = float(rivals.max())
+    second = second_best(scores, x, y, len(template), least=-1.0)
+    offset = peak_offset(scores, x, y, reach)
     return (float(best) if best >= _CLEAR * second else 0.0), offset

@@ -108,31 +108,50 @@ def find_object(
     allowed = (share >= _OPAQUE) & (share <= _DOUBLED) & (whole >= least)
     if not allowed.any():
         return None
-    line = (np.arange(-reach, reach + 1, dtype=np.float32) / max(reach, 1)) ** 2
-    told = np.where(allowed, evidence, 0.0) * (1.0 - aside * 0.5 * (line[:, None] + line))
+    told = np.where(allowed, evidence, 0.0) * (1.0 - aside * 0.5 * squared_share(reach))
     # A plain car fits anywhere within itself: where it reaches beyond its outline, it is not.
     beyond = cv2.matchTemplate((chart - ground) ** 2, look.about, cv2.TM_CCORR)
     evidence = evidence - beyond
     _, _, _, (x, y) = cv2.minMaxLoc(np.where(allowed, told - beyond, -np.inf).astype(np.float32))
-    near = max(3, (len(look.grey) - 1) // 3)
-    rivals = told.copy()
-    rivals[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = 0.0
-    best = float(told[y, x])
-    if best < _CLEAR * float(rivals.max()):
+    side, best = len(look.grey), float(told[y, x])
+    if best < _CLEAR * second_best(told, x, y, side, least=0.0):
         return None
-    side = len(look.grey)
     here, below = chart[y : y + side, x : x + side], ground[y : y + side, x : x + side]
     for end in look.ends():
         seen, _, differs = _evidence(here, below, look.grey, end)
         if differs[0, 0] >= _MATTERS * whole[y, x] and seen[0, 0] < _END:
             return None
+    offset = peak_offset(evidence, x, y, reach)
+    return AppearanceCoverage(float(share[y, x]), offset, best)
+
+
+def squared_share(reach: int) -> Grey:
+    """(2 reach + 1, 2 reach + 1): squared distance from the middle, as a share of the reach's."""
+    line = (np.arange(-reach, reach + 1, dtype=np.float32) / max(reach, 1)) ** 2
+    return np.asarray(line[:, None] + line[None], dtype=np.float32)
+
+
+def second_best(scores: Grey, x: int, y: int, side: int, least: float) -> float:
+    """The highest score away from the best at column x and row y, by a third of a template's side;
+    `least` without another.
+    """
+    near = max(3, (side - 1) // 3)
+    rivals = scores.copy()
+    rivals[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = least
+    return float(rivals.max())
+
+
+def peak_offset(scores: Grey, x: int, y: int, reach: int) -> Array:
+    """(2,) cells from the middle, (reach, reach), to the peak at column x and row y, by parabolas
+    through its neighbours.
+    """
     offset = np.array([x - reach, y - reach], dtype=np.float64)
-    for axis, values, k in ((0, evidence[y], x), (1, evidence[:, x], y)):
-        if 0 < k < len(values) - 1:
-            a, b, c = (float(v) for v in values[k - 1 : k + 2])
+    for axis, line, k in ((0, scores[y], x), (1, scores[:, x], y)):
+        if 0 < k < len(line) - 1:
+            a, b, c = (float(v) for v in line[k - 1 : k + 2])
             bend = a - 2 * b + c
             offset[axis] += 0.5 * (a - c) / bend if bend < 0 else 0.0
-    return AppearanceCoverage(float(share[y, x]), offset, best)
+    return offset
 
 
 def _evidence(chart: Grey, ground: Grey, look: Grey, inside: Grey) -> tuple[Grey, Grey, Grey]:

@@ -17,16 +17,11 @@ from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
-from localizer.odometry import (
-    GroundUncertainty,
-    OdometryConfig,
-    OdometryFrame,
-    OdometryStatus,
-    TerrainModel,
-    VisualOdometry,
-    examine,
-    odometry_optimizer,
-)
+from localizer.odometry.config import OdometryConfig
+from localizer.odometry.estimate import OdometryFrame, OdometryStatus
+from localizer.odometry.ground import GroundUncertainty, TerrainModel
+from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.usability import examine
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
     PoseConstraint,

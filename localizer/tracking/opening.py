@@ -10,7 +10,7 @@ import numpy as np
 from localizer.config import LocalizerConfig
 from localizer.errors import ModelError
 from localizer.features.detail import DetailExtractor
-from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load_extractor
+from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.geometry.camera import Camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
@@ -117,8 +117,6 @@ def _warm_up(
             f"{extractor.name}: the model has {given} levels of features, "
             f"localizer.registration.iterations {config.registration.iterations} need {wanted}"
         )
-    if isinstance(extractor, DeviceExtractor):
-        extractor.extract_on_device(black)  # allocates the outputs there
     for channels in {level.features.shape[-1] for level in pyramid.levels}:
         optimizer.warm_up(channels)
     renderer.warm_up()

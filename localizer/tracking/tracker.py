@@ -6,7 +6,6 @@ import threading
 from dataclasses import dataclass, field, replace
 
 from localizer.config import LocalizerConfig
-from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.integrity.acceptance import is_acceptable
 from localizer.integrity.confirmation import IndependentEvidence
@@ -34,17 +33,6 @@ class TrackerState:
 
     motion: MotionState | None = None
     track_status: TrackStatus = field(default_factory=TrackStatus)
-
-
-@dataclass(frozen=True)
-class _Pose:
-    """The published pose of a frame, from the map or from the odometry."""
-
-    world_from_camera: Pose
-    covariance: Array
-    quality: float
-    status: RegistrationStatus
-    scale_sigma: float | None = None
 
 
 class Tracker:
@@ -145,13 +133,12 @@ class Tracker:
         if rejoins and not bridges and result is not None:  # the prediction was of the wrong place
             moved = motion.start(_restart(result, ahead), self._config.motion)
         self._store(seen, moved, track_status)
-        given, usable = _given(outcome, result, carried, track_status)
-        if usable and not bridges:
+        estimate = _estimate(frame, outcome, result, carried, track_status)
+        if estimate.accepted and not bridges:
             # Position and tilt err together, from frame to frame again; the turn between two frames
             # is known several times better. The sigmas told stay the registration's: the map errs
             # alike for seconds, which a filter takes for knowledge.
-            given = replace(given, world_from_camera=moved.prior.world_from_camera)
-        estimate = _estimate(frame, given, track_status, usable)
+            estimate = replace(estimate, world_from_camera=moved.prior.world_from_camera)
         if (
             estimate.accepted
             and not bridges
@@ -244,36 +231,32 @@ def _restart(result: Registration, ahead: MotionState) -> PosePrior:
     )
 
 
-def _given(
+def _estimate(
+    frame: Frame,
     outcome: RegistrationOutcome,
     result: Registration | None,
     carried: PropagatedPose,
     track_status: TrackStatus,
-) -> tuple[_Pose, bool]:
-    """The published pose, and whether it may be used."""
-    if track_status.state is TrackingState.BRIDGING:
-        pose, covariance = carried.world_from_camera, carried.covariance
-        if pose is not None and covariance is not None:
-            ok = RegistrationStatus.OK
-            return _Pose(pose, covariance, carried.quality, ok, carried.scale_sigma), True
+) -> PoseEstimate:
+    """The published pose of a frame, from the map or from the odometry."""
     status = result.status if result is not None else RegistrationStatus.NO_OVERLAP
-    quality = result.quality if result is not None and status is RegistrationStatus.OK else 0.0
-    seen = track_status.state is not TrackingState.BRIDGING and not track_status.tentative
-    given = _Pose(outcome.world_from_camera, outcome.covariance, quality, status)
-    return given, outcome.acceptable and seen
-
-
-def _estimate(frame: Frame, given: _Pose, track_status: TrackStatus, usable: bool) -> PoseEstimate:
-    return PoseEstimate(
-        world_from_camera=given.world_from_camera,
-        covariance=given.covariance,
-        quality=given.quality,
-        state=track_status.state,
-        status=given.status,
-        accepted=usable,
+    bridges = track_status.state is TrackingState.BRIDGING
+    estimate = PoseEstimate(
+        outcome.world_from_camera,
+        outcome.covariance,
+        result.quality if result is not None and status is RegistrationStatus.OK else 0.0,
+        track_status.state,
+        status,
+        accepted=outcome.acceptable and not bridges and not track_status.tentative,
         exposure_time_ns=frame.exposure_time_ns,
         sequence=frame.sequence,
         camera=frame.camera,
         last_fix_ns=track_status.last_fix_ns,
-        scale_sigma=given.scale_sigma,
     )
+    pose, covariance = carried.world_from_camera, carried.covariance
+    if not bridges or pose is None or covariance is None:
+        return estimate
+    return replace(
+        estimate, world_from_camera=pose, covariance=covariance, quality=carried.quality,
+        status=RegistrationStatus.OK, accepted=True, scale_sigma=carried.scale_sigma,
+    )  # fmt: skip

@@ -21,18 +21,13 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import CommandAnswer, LookAtRefusal
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
+from mavlink_bridge.place_hint import GLOBAL_FRAMES
 from mavlink_bridge.vehicle.origin import north_east
 
 LOOK_AT_PLACE = mavlink.MAV_CMD_DO_SET_ROI_LOCATION
 LOOK_AHEAD = mavlink.MAV_CMD_DO_SET_ROI_NONE
 LOOK_AT_TARGET = mavlink.MAV_CMD_USER_4  # ours: param1 is the target's number, 0 ends it
 LOOKS = frozenset((LOOK_AT_PLACE, LOOK_AHEAD, LOOK_AT_TARGET))
-_FRAMES = (
-    mavlink.MAV_FRAME_GLOBAL,
-    mavlink.MAV_FRAME_GLOBAL_INT,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-)
 _AGAIN_NS = 1_000_000_000  # a target that moves is followed so often
 _MOVED_M = 1.0
 _PATIENCE_NS = 3_000_000_000  # for the autopilot's answer
@@ -181,6 +176,6 @@ def _place(message: Any) -> _Place | None:
         latitude, longitude, altitude = message.param5, message.param6, message.param7
         frame = int(mavlink.MAV_FRAME_GLOBAL)
     is_place = abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(altitude) < 2e4
-    if frame not in _FRAMES or not is_place or (latitude == 0.0 and longitude == 0.0):
+    if frame not in GLOBAL_FRAMES or not is_place or (latitude == 0.0 and longitude == 0.0):
         return None
     return _Place(latitude, longitude, altitude, frame)

@@ -349,8 +349,6 @@ class MessageEncoder:
             reason = alert(AlertId.EKF_ORIGIN_FAR, kilometres=math.hypot(*ned) * 1e-3)
             return HeldOutput(reason, "withheld_far_origin")
         formula = context.profile.covariance
-        if self._config.covariance != "profile":
-            formula = self._config.covariance
         if kind == "odometry":
             return self._odometry(e, ned, formula, context)
         if not self._config.send_attitude:

@@ -118,5 +118,5 @@ class InjectionEnable:
                 if wanted:
                     self._memory.store_enabled(by_channel=isinstance(by, RcChannel))
                 else:
-                    self._memory.store_disabled()
+                    self._memory.drop()
         self._changed(alert(AlertId.INJECTION_ON if wanted else AlertId.INJECTION_OFF, by=by))

@@ -133,7 +133,7 @@ class Injector:
         self._period_ns = int(1e9 / config.rate_hz)
         self._least_gap_ns = int(self._period_ns / 1.5)  # 30 Hz never passes 50 Hz
         self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
-        self.guard = YawGuard(config.yaw_guard)
+        self.guard = YawGuard()
         self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
         self.latency = Latency()
         self._fresh: VisionFix | None = None

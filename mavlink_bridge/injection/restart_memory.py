@@ -54,7 +54,7 @@ class RestartMemory:
         self._thread = threading.Thread(target=self._run, name=path.stem, daemon=True)
         self._thread.start()
 
-    def recall(self) -> tuple[dict[str, Any], float] | None:
+    def recall_state(self) -> tuple[dict[str, Any], float] | None:
         """The stored state and its age, s; None if there is none, it is older than 600 s, or it
         cannot be trusted. After this call a clean `stop` deletes the file.
         """
@@ -77,14 +77,15 @@ class RestartMemory:
             return None
         return (content, age_s) if 0.0 <= age_s <= _OLDEST_S else None
 
-    def store(self, state: dict[str, Any]) -> None:
+    def store_state(self, state: dict[str, Any]) -> None:
         """Write this state (JSON values) now and every 30 s, in the memory's thread."""
         self._in_use = True
         self._state = state
         self._wake.set()
 
     def drop(self) -> None:
-        """Delete the file, in the memory's thread, and write nothing until the next `store`."""
+        """Delete the file, in the memory's thread, and write nothing until the next
+        `store_state`."""
         self._state = None
         self._wake.set()
 
@@ -137,44 +138,31 @@ class RestartMemory:
         replace_file(self._path, json.dumps(state | about | stamps), durable=True)
 
 
-class InjectionEnableMemory:
-    """Remembers that injection is enabled; see `RestartMemory`."""
-
-    def __init__(self, memory: RestartMemory) -> None:
-        self._memory = memory
+class InjectionEnableMemory(RestartMemory):
+    """Remembers that injection is enabled; `drop` it when injection is disabled."""
 
     def recall(self) -> tuple[bool, float] | None:
         """Whether an RC channel (True) or a command (False) enabled injection, and the state's age,
         s; None if injection was disabled or the file cannot be trusted.
         """
-        found = self._memory.recall()
+        found = self.recall_state()
         if found is None or found[0].get("open") is not True:
             return None
         return found[0].get("by_channel") is True, found[1]
 
     def store_enabled(self, *, by_channel: bool) -> None:
         """Store that injection is enabled. by_channel: by an RC channel, otherwise by a command."""
-        self._memory.store({"open": True, "by_channel": by_channel})
-
-    def store_disabled(self) -> None:
-        """Delete the stored state, because injection is disabled."""
-        self._memory.drop()
-
-    def stop(self, *, clean_shutdown: bool = True) -> None:
-        """End the memory; see `RestartMemory.stop`."""
-        self._memory.stop(clean_shutdown=clean_shutdown)
+        self.store_state({"open": True, "by_channel": by_channel})
 
 
-class ShadowFailureMemory:
-    """Remembers a failed shadow check; see `RestartMemory`."""
+class ShadowFailureMemory(RestartMemory):
+    """Remembers a failed shadow check."""
 
-    def __init__(self, memory: RestartMemory) -> None:
-        self._memory = memory
-        self._kept = False
+    _kept = False
 
     def recall(self) -> bool:
         """Whether the shadow check had failed in the previous process; that is stored again."""
-        found = self._memory.recall()
+        found = self.recall_state()
         state = None if found is None else found[0].get("against")
         of_0_1 = isinstance(state, str) and bool(state) and state.isprintable()  # the reason
         against = state is True or of_0_1
@@ -187,10 +175,6 @@ class ShadowFailureMemory:
             return
         self._kept = against
         if against:
-            self._memory.store({"against": True})
+            self.store_state({"against": True})
         else:
-            self._memory.drop()
-
-    def stop(self, *, clean_shutdown: bool = True) -> None:
-        """End the memory; see `RestartMemory.stop`."""
-        self._memory.stop(clean_shutdown=clean_shutdown)
+            self.drop()

@@ -15,11 +15,14 @@ import statistics
 from collections import deque
 from dataclasses import dataclass
 
-from mavlink_bridge.config import YawGuardConfig
 from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import wrap_pi
 from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
+_LIMIT_RAD = math.radians(3.5)  # against the autopilot's yaw, or its gyros since earlier fixes
+_GROSS_RAD = math.radians(20.0)  # largest difference in any case
+_MEMORY_S = 60.0  # time for which the gyros are used
+_MINIMUM_SAMPLES = 5  # fixes compared: the majority blocks, all release
 _BASELINE_NS = 1_000_000_000
 _RELEASE_SHARE = 0.7
 _BLIND_AFTER = 20  # fixes in a row
@@ -38,16 +41,15 @@ class YawVerdict:
 class YawGuard:
     """Rejects fixes whose yaw changed wrongly, and blocks injection if most of the last ones did.
 
-    It blocks if the majority of `minimum_samples` fixes fail, because noise lets some fixes of a
+    It blocks if the majority of five fixes fail, because noise lets some fixes of a
     rotated frame pass. It releases after as many good fixes in a row, tested with a smaller limit.
     unchecked: number of fixes without a yaw to compare.
     """
 
-    def __init__(self, config: YawGuardConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         # (time, vision minus gyro heading, vision minus autopilot)
         self._accepted: deque[tuple[int, float, float]] = deque(maxlen=256)
-        self._last: deque[bool] = deque(maxlen=config.minimum_samples)
+        self._last: deque[bool] = deque(maxlen=_MINIMUM_SAMPLES)
         self._reset_count = 0  # of the fix before
         self.blocked = False
         self.unchecked = 0
@@ -68,8 +70,6 @@ class YawGuard:
         """Check one fix, in order of time. autopilot: its attitude at that time, None if unknown. A
         fix without both yaws passes unless the guard blocks, and counts as `unchecked`.
         """
-        if not self._config.enabled:
-            return YawVerdict(True, None)
         time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad
         reset = fix.reset_count != self._reset_count
         self._reset_count = fix.reset_count
@@ -96,24 +96,23 @@ class YawGuard:
         if self.blocked:
             change = len(last) == last.maxlen and all(last)
         else:
-            change = 2 * last.count(False) > self._config.minimum_samples
+            change = 2 * last.count(False) > _MINIMUM_SAMPLES
         if change:
             self.blocked = not self.blocked
             last.clear()
 
     def _agrees(self, time_ns: int, difference: float, to_gyros: float, reset: bool) -> bool:
-        limit = math.radians(self._config.limit_deg) * (_RELEASE_SHARE if self.blocked else 1.0)
-        gross = math.radians(self._config.gross_deg)
+        limit = _LIMIT_RAD * (_RELEASE_SHARE if self.blocked else 1.0)
         near = abs(difference) <= limit
-        if abs(difference) > gross or not self._accepted:
+        if abs(difference) > _GROSS_RAD or not self._accepted:
             return near
         newest_ns = self._accepted[-1][0]
         gap_s = (time_ns - newest_ns) * 1e-9
-        if gap_s > self._config.memory_s:
+        if gap_s > _MEMORY_S:
             return near
         recent = [entry for entry in self._accepted if newest_ns - entry[0] <= _BASELINE_NS]
         turned = abs(statistics.median(wrap_pi(to_gyros - entry[1]) for entry in recent))
-        if turned <= min(limit + VEHICLE_SENSORS.gyro_drift_radps * gap_s, gross):
+        if turned <= min(limit + VEHICLE_SENSORS.gyro_drift_radps * gap_s, _GROSS_RAD):
             return True
         # The gyro heading suffers where ATTITUDE was lost in a turn; the autopilot's yaw does not.
         against = abs(statistics.median(wrap_pi(difference - entry[2]) for entry in recent))

@@ -19,6 +19,7 @@ from mavlink_bridge.preflight.failsafes import (
 )
 from mavlink_bridge.preflight.parameters import ParameterClient
 from mavlink_bridge.preflight.rules import (
+    DoctorFinding,
     ParameterRule,
     Read,
     ardupilot_rules,
@@ -37,22 +38,6 @@ _RATE_SHARE = 0.7
 _LOST_SHARE = 0.02
 _GIMBAL_AGE_NS = 200_000_000  # of an exposure, roughly
 _PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
-
-
-@dataclass(frozen=True)
-class DoctorFinding:
-    """Result of one check. required: if it fails, the vehicle is not fit to fly; otherwise advice;
-    fix: parameter value to write, None if none would help; reboot: needed after it.
-    """
-
-    name: str
-    found: str
-    needed: str
-    why: str
-    ok: bool
-    required: bool
-    fix: float | None = None
-    reboot: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,15 +91,6 @@ def check_parameters(rules: Iterable[ParameterRule], read: Read) -> list[DoctorF
             )
         findings.append(finding)
     return findings
-
-
-def check_failsafes(config: BridgeConfig, read: Read, *, px4: bool = False) -> list[DoctorFinding]:
-    """Check the autopilot's failsafes for the end of vision: advice only, never written."""
-    lines = px4_failsafes(config, read) if px4 else failsafes(config, read)
-    return [
-        DoctorFinding(line.name, line.found, line.needed, line.why, line.ok, required=False)
-        for line in lines
-    ]
 
 
 @dataclass(frozen=True)
@@ -307,7 +283,7 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
             ]
         findings += check_parameters(rules, client.read)
         known = client.read_known(PX4_PARAMETERS if px4 else PARAMETERS)
-        findings += check_failsafes(config, known.get, px4=px4)
+        findings += (px4_failsafes if px4 else failsafes)(config, known.get)
     return Diagnosis(tuple(findings), state)
 
 

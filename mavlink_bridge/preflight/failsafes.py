@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.preflight.rules import Read
+from mavlink_bridge.preflight.rules import DoctorFinding, Read
 
 _COPTER_LANDS = {
     0.0: "nothing: it drifts on, only reported",
@@ -17,17 +17,6 @@ _COPTER_LANDS = {
     2.0: "ALT_HOLD 5 to 8 s after the last position",
     3.0: "LAND, out of ALT_HOLD and STABILIZE too",
 }
-
-
-@dataclass(frozen=True)
-class Failsafe:
-    """Result of one failsafe check: value found, recommended value, and why."""
-
-    name: str
-    found: str
-    needed: str
-    why: str
-    ok: bool
 
 
 @dataclass(frozen=True)
@@ -73,8 +62,10 @@ PARAMETERS = (*(wanted.name for wanted in _WANTED), "FENCE_TYPE", "FENCE_ACTION"
 """What `failsafes` reads."""
 
 
-def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
-    """Check ArduPilot's failsafe parameters; missing ones are skipped. [] in mode ``off``."""
+def failsafes(config: BridgeConfig, read: Read) -> list[DoctorFinding]:
+    """Check ArduPilot's failsafe parameters: advice only. Missing ones are skipped; [] in mode
+    ``off``.
+    """
     if config.mode == "off":
         return []
     lines = [*_listed(_WANTED, read), *_fence(read)]
@@ -83,11 +74,11 @@ def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
         found = _COPTER_LANDS.get(action, f"FS_EKF_ACTION {action:g}")
         why = "also when the companion dies; a supervised one is back sooner (integrity.md)"
         ok = action in (1.0, 2.0)
-        lines.append(Failsafe("when vision ends", found, "as the pilot expects", why, ok))
+        lines.append(_advice("when vision ends", found, "as the pilot expects", why, ok))
     return lines
 
 
-def px4_failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
+def px4_failsafes(config: BridgeConfig, read: Read) -> list[DoctorFinding]:
     """Check PX4's failsafe parameters (1.15 and later); as `failsafes`."""
     if config.mode == "off":
         return []
@@ -102,41 +93,45 @@ def px4_failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
         value = read(name)
         if value is not None:
             needed, ok = f"{least:g} to {most:g}", least <= value <= most
-            lines.append(Failsafe(name, f"{value:g}", needed, why, ok))
+            lines.append(_advice(name, f"{value:g}", needed, why, ok))
     gnss = read("EKF2_GPS_CTRL")
     if gnss is not None and config.injection.message != "global_position_sensor":
         why = "beside GNSS, EKF2 fits an offset to vision and keeps it when GNSS ends"
         needed, ok = "bit 0 clear, or message: global_position_sensor", not int(gnss) & 1
-        lines.append(Failsafe("EKF2_GPS_CTRL", f"{gnss:g}", needed, why, ok))
+        lines.append(_advice("EKF2_GPS_CTRL", f"{gnss:g}", needed, why, ok))
     action = read("COM_POSCTL_NAVL")
     if action is not None:
         found = _PX4_ENDS.get(action, f"COM_POSCTL_NAVL {action:g}")
         why = "from PX4's documentation, not flown; also when the companion dies (integrity.md)"
         ok = action in _PX4_ENDS
-        lines.append(Failsafe("when vision ends", found, "as the pilot expects", why, ok))
+        lines.append(_advice("when vision ends", found, "as the pilot expects", why, ok))
     return lines
 
 
-def _listed(all_wanted: tuple[_Wanted, ...], read: Read) -> list[Failsafe]:
+def _listed(all_wanted: tuple[_Wanted, ...], read: Read) -> list[DoctorFinding]:
     lines = []
     for wanted in all_wanted:
         value = read(wanted.name)
         if value is not None:
             needed = " or ".join(f"{v:g}" for v in wanted.allowed)
             ok = any(abs(value - v) < 1e-6 for v in wanted.allowed)
-            lines.append(Failsafe(wanted.name, f"{value:g}", needed, wanted.why, ok))
+            lines.append(_advice(wanted.name, f"{value:g}", needed, wanted.why, ok))
     return lines
 
 
-def _fence(read: Read) -> list[Failsafe]:
+def _fence(read: Read) -> list[DoctorFinding]:
     """Findings about the fence; [] if it is off."""
     kind, action = read("FENCE_TYPE"), read("FENCE_ACTION")
     if not read("FENCE_ENABLE") or kind is None or action is None:
         return []
     by_height = bool(int(kind) & _HEIGHT_FENCE)
     why = "bit 0, maximum height: the one fence that needs no position"
-    lines = [Failsafe("FENCE_TYPE", f"{kind:g}", "bit 0 set", why, by_height)]
+    lines = [_advice("FENCE_TYPE", f"{kind:g}", "bit 0 set", why, by_height)]
     why = "RTL would fly home by the position that is doubted"
     needed = " or ".join(f"{v:g}" for v in _FENCE_LAND)
-    lines.append(Failsafe("FENCE_ACTION", f"{action:g}", needed, why, action in _FENCE_LAND))
+    lines.append(_advice("FENCE_ACTION", f"{action:g}", needed, why, action in _FENCE_LAND))
     return lines
+
+
+def _advice(name: str, found: str, needed: str, why: str, ok: bool) -> DoctorFinding:
+    return DoctorFinding(name, found, needed, why, ok, required=False)

@@ -26,6 +26,22 @@ Read = Callable[[str], float | None]
 
 
 @dataclass(frozen=True)
+class DoctorFinding:
+    """Result of one check. required: if it fails, the vehicle is not fit to fly; otherwise advice;
+    fix: parameter value to write, None if none would help; reboot: needed after it.
+    """
+
+    name: str
+    found: str
+    needed: str
+    why: str
+    ok: bool
+    required: bool
+    fix: float | None = None
+    reboot: bool = False
+
+
+@dataclass(frozen=True)
 class ParameterRule:
     """A parameter's requirement. names: the parameter and its older names, newest first.
 

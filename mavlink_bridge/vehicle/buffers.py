@@ -7,7 +7,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, InertialSample
@@ -81,20 +81,24 @@ def _neighbours(samples: Sequence[_Sample], time_ns: int) -> tuple[_Sample, _Sam
     return before, after, (time_ns - before.time_ns) / span if span else 1.0
 
 
-class VectorBuffer:
-    """History of vectors such as positions, with linear interpolation."""
+class _Buffer(Generic[_Sample]):
+    """History of samples in time order."""
 
     def __init__(self) -> None:
-        self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
+        self._samples: deque[_Sample] = deque(maxlen=_LENGTH)
 
     def clear(self) -> None:
         """Empty the buffer."""
         self._samples.clear()
 
-    def add(self, time_ns: int, values: tuple[float, ...]) -> None:
+    def add(self, sample: _Sample) -> None:
         """Append; a sample that is not newer than the newest is dropped."""
-        if not self._samples or time_ns > self._samples[-1].time_ns:
-            self._samples.append(VectorSample(time_ns, values))
+        if not self._samples or sample.time_ns > self._samples[-1].time_ns:
+            self._samples.append(sample)
+
+
+class VectorBuffer(_Buffer[VectorSample]):
+    """History of vectors such as positions, with linear interpolation."""
 
     def at(self, time_ns: int) -> tuple[float, ...] | None:
         """Values interpolated at a time; None outside the buffer or in a gap of more than 0.5 s."""
@@ -119,25 +123,22 @@ class PlaceBuffer(VectorBuffer):
         return latitude, wrap_degrees(longitude), altitude
 
 
-class ZoomBuffer:
+class ZoomBuffer(_Buffer[VectorSample]):
     """Zoom levels (0 to 100 %) of the camera component that first reported one."""
 
-    def __init__(self) -> None:
-        self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
-        self._component: int | None = None
+    _component: int | None = None
 
     def clear(self) -> None:
         """Empty the buffer; the camera that reports next is then used."""
-        self._samples.clear()
+        super().clear()
         self._component = None
 
-    def add(self, time_ns: int, component: int, level: float) -> None:
+    def add_level(self, time_ns: int, component: int, level: float) -> None:
         """Append a level; NaN: the camera does not know it. Ignored from another component."""
         if self._component is None:
             self._component = component
-        newer = not self._samples or time_ns > self._samples[-1].time_ns
-        if component == self._component and newer:
-            self._samples.append(VectorSample(time_ns, (level,)))
+        if component == self._component:
+            self.add(VectorSample(time_ns, (level,)))
 
     def at(self, time_ns: int, hold_s: float) -> float | None:
         """The level at a time, linear between reports; None if unknown. The newest report is valid
@@ -160,15 +161,8 @@ class ZoomBuffer:
         return level if math.isfinite(level) else None
 
 
-class AttitudeBuffer:
+class AttitudeBuffer(_Buffer[Attitude]):
     """History of attitudes with spherical interpolation."""
-
-    def __init__(self) -> None:
-        self._samples: deque[Attitude] = deque(maxlen=_LENGTH)
-
-    def clear(self) -> None:
-        """Empty the buffer."""
-        self._samples.clear()
 
     def add(self, sample: Attitude) -> None:
         """Append, with its gyro heading integrated; one that is not newer is dropped."""
@@ -209,20 +203,8 @@ class AttitudeBuffer:
         return attitude(time_ns, q, after.rates if t > 0.5 else before.rates, heading)
 
 
-class InertialBuffer:
+class InertialBuffer(_Buffer[InertialSample]):
     """History of IMU samples in time order."""
-
-    def __init__(self) -> None:
-        self._samples: deque[InertialSample] = deque(maxlen=_LENGTH)
-
-    def clear(self) -> None:
-        """Empty the buffer."""
-        self._samples.clear()
-
-    def add(self, sample: InertialSample) -> None:
-        """Append; one that is not newer than the newest is dropped."""
-        if not self._samples or sample.time_ns > self._samples[-1].time_ns:
-            self._samples.append(sample)
 
     def since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """The samples after a time, oldest first."""
@@ -230,7 +212,7 @@ class InertialBuffer:
         return tuple(samples[bisect_right(samples, time_ns, key=lambda s: s.time_ns) :])
 
 
-class GimbalBuffer:
+class GimbalBuffer(_Buffer[GimbalSample]):
     """History of one gimbal's attitude, from the best source available.
 
     It uses the first gimbal that sends, as long as it sends, because mixed angles of two gimbals
@@ -239,7 +221,7 @@ class GimbalBuffer:
     """
 
     def __init__(self, device: tuple[int, int] = (0, 0)) -> None:
-        self._samples: deque[GimbalSample] = deque(maxlen=_LENGTH)
+        super().__init__()
         self._wanted = device
         self.others: set[tuple[int, int]] = set()
 
@@ -247,10 +229,6 @@ class GimbalBuffer:
     def device(self) -> tuple[int, int] | None:
         """Component and device id of the gimbal that is used; None before the first."""
         return self._samples[-1].device if self._samples else None
-
-    def clear(self) -> None:
-        """Empty the buffer."""
-        self._samples.clear()
 
     def add(self, sample: GimbalSample) -> None:
         """Append, unless a better source (1 s) or the selected gimbal (3 s) has reported lately."""

@@ -6,7 +6,7 @@ Measured or read from source; messages.md has the table and the sources.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -42,34 +42,20 @@ class FirmwareProfile:
     known: bool = True
 
 
-_ARDUPILOT_MESSAGES: tuple[InjectionMessage, ...] = (
-    "vision_position_estimate",
-    "odometry",
-    "gps_input",
-    "external_position_estimate",
-)
-
 ARDUPILOT = FirmwareProfile(
     name="ArduPilot 4.5-4.7",
     covariance="cbrt",
     projection="ardupilot",
     max_delay_ms=250.0,
-    messages=_ARDUPILOT_MESSAGES,
+    messages=(
+        "vision_position_estimate", "odometry", "gps_input", "external_position_estimate",
+    ),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     least_lag=True,
     position_delta=True,
-)
+)  # fmt: skip
 # Pull request 32084 (merged February 2026) replaced the cube root.
-ARDUPILOT_SQRT = FirmwareProfile(
-    name="ArduPilot 4.8+",
-    covariance="sqrt",
-    projection="ardupilot",
-    max_delay_ms=250.0,
-    messages=_ARDUPILOT_MESSAGES,
-    odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
-    least_lag=True,
-    position_delta=True,
-)
+ARDUPILOT_SQRT = replace(ARDUPILOT, name="ArduPilot 4.8+", covariance="sqrt")
 PX4 = FirmwareProfile(
     name="PX4 1.15+",
     covariance="variance",

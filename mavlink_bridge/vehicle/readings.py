@@ -19,6 +19,7 @@ from mavlink_bridge.vehicle.buffers import (
     InertialBuffer,
     PlaceBuffer,
     VectorBuffer,
+    VectorSample,
     ZoomBuffer,
     attitude,
 )
@@ -202,12 +203,12 @@ class VehicleReadings:
         level = float(m.zoomLevel)
         if math.isfinite(level):
             check_within(_ZOOM_PERCENT, level)
-        self.zooms.add(time_ns, m.get_srcComponent(), level if level >= 0.0 else math.nan)
+        self.zooms.add_level(time_ns, m.get_srcComponent(), level if level >= 0.0 else math.nan)
 
     def _local_position(self, m: Any, time_ns: int) -> None:
         check_within(_DISTANCE_M, m.x, m.y, m.z)
         check_within(_SPEED_MPS, m.vx, m.vy, m.vz)
-        self.locals.add(time_ns, (m.x, m.y, m.z))
+        self.locals.add(VectorSample(time_ns, (m.x, m.y, m.z)))
         self.state = replace(
             self.state,
             local_position_ned=(m.x, m.y, m.z),
@@ -220,12 +221,13 @@ class VehicleReadings:
             return  # what firmwares send before they have a position
         check_place(m.lat, m.lon)
         _check_heights(m.alt, m.relative_alt)
-        self.globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
+        place = (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3)
+        self.globals.add(VectorSample(time_ns, place))
         self.state = replace(
             self.state,
-            latitude_deg=m.lat * 1e-7,
-            longitude_deg=m.lon * 1e-7,
-            altitude_amsl_m=m.alt * 1e-3,
+            latitude_deg=place[0],
+            longitude_deg=place[1],
+            altitude_amsl_m=place[2],
             altitude_relative_m=m.relative_alt * 1e-3,
             position_time_ns=time_ns,
         )

@@ -10,11 +10,9 @@ import multiprocessing
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 import cv2
@@ -37,8 +35,7 @@ from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera
 from sitl.camera.zoom import Zooming, ZoomLens
 from sitl.errors import WorldCameraError
 
-Command = Literal["pause", "resume", "stop"]
-Message = TruthSample | Command | PictureFault | Zooming | None  # None ends the fault
+Message = TruthSample | Literal["stop"] | PictureFault | Zooming | None  # None ends the fault
 
 _START_S = 300.0  # numba compiles on the first run, a minute where there is room
 _STOP_S = 60.0
@@ -76,8 +73,8 @@ class WorldCameraConfig:
 
 @dataclass(frozen=True)
 class CameraStatistics:
-    """Counters of the world camera. skipped: exposures left out because the process was late or
-    paused; lost: datagrams of the stream dropped on purpose.
+    """Counters of the world camera. skipped: exposures left out because the process was late or the
+    video silent; lost: datagrams of the stream dropped on purpose.
     """
 
     frames: int
@@ -89,13 +86,9 @@ class CameraStatistics:
 class WorldCameraProcess:
     """Controls the world camera's process. `send` needs true poses in order, at 20 Hz or more."""
 
-    def __init__(
-        self,
-        config: WorldCameraConfig,
-        pipe: Callable[[], tuple[Connection, Connection]] = multiprocessing.Pipe,
-    ) -> None:
+    def __init__(self, config: WorldCameraConfig) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, child = pipe()
+        self._connection, child = multiprocessing.Pipe()
         self._process = context.Process(
             target=_run, args=(config, child), name="world-camera", daemon=True
         )
@@ -113,26 +106,6 @@ class WorldCameraProcess:
         if not self._connection.poll(_START_S):
             raise WorldCameraError(f"the world camera was not ready after {_START_S:.0f} s")
         self._receive()
-
-    def send(self, sample: TruthSample) -> None:
-        """Send a true pose of the vehicle. Raises `WorldCameraError` if the process has died."""
-        self._send(sample)
-
-    def pause(self) -> None:
-        """Stop sending frames, as if the camera's link were cut."""
-        self._send("pause")
-
-    def resume(self) -> None:
-        """Send frames again."""
-        self._send("resume")
-
-    def fault(self, fault: PictureFault | None) -> None:
-        """Apply a video fault from now on; None ends it."""
-        self._send(fault)
-
-    def zoom(self, zooming: Zooming) -> None:
-        """Change the focal length over time, from now on."""
-        self._send(zooming)
 
     def stop(self) -> None:
         """End the process; `statistics` then holds its counters. Harmless if it is not running."""
@@ -157,15 +130,13 @@ class WorldCameraProcess:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _send(self, message: Message) -> None:
+    def send(self, message: Message) -> None:
+        """Send a true pose of the vehicle, a video fault (None ends it) or a change of the focal
+        length. Raises `WorldCameraError` if the process has died.
+        """
         with self._lock:
             if self._connection.poll():
                 self._receive()
@@ -258,7 +229,7 @@ class _CameraServer:
         self._lens, self._zoom = VideoFaultInjector(c.seed), ZoomLens(c.camera)
         self._outbox: deque[_DelayedFrame] = deque()
         self._track = PoseTrack()
-        self._paused = self._stopped = False
+        self._stopped = False
         self._frames = self._skipped = 0
 
     def __enter__(self) -> _CameraServer:
@@ -310,13 +281,11 @@ class _CameraServer:
             self._lens.set(message)
         elif isinstance(message, Zooming):
             self._zoom.set(message)
-        elif message == "stop":
-            self._stopped = True
         else:
-            self._paused = message == "pause"
+            self._stopped = True
 
     def _expose(self, time_ns: int) -> None:
-        if self._paused or self._lens.is_silent:
+        if self._lens.is_silent:
             self._skipped += 1
             return
         exposure = self._camera.expose(time_ns, self._track)

@@ -10,7 +10,6 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -165,14 +164,3 @@ class FrameLog:
         """Close the files."""
         self._file.close()
         self._tum.close()
-
-    def __enter__(self) -> FrameLog:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

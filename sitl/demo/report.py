@@ -240,11 +240,8 @@ def _write_frames(path: Path, errors: FrameErrors) -> None:
         )  # fmt: skip
         values = (errors.translation_m, errors.horizontal_m, errors.rotation_deg)
         for time_ns, processed, *row in zip(errors.time_ns, errors.processed, *values, strict=True):
-            writer.writerow((int(time_ns), int(processed), *(_cell(x) for x in row)))
-
-
-def _cell(value: float) -> str:
-    return f"{value:.4f}" if np.isfinite(value) else ""
+            known = (f"{x:.4f}" if np.isfinite(x) else "" for x in row)
+            writer.writerow((int(time_ns), int(processed), *known))
 
 
 def print_report(report: FlightReport, folder: Path) -> None:

@@ -23,6 +23,7 @@ from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.importers.height_crs import utm_zone
 from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.world import WorldInfo
@@ -94,8 +95,7 @@ def build_satellite_map(
     share done.
     """
     cache = TileCache.open(seen)
-    zone = int((world.origin.longitude_deg + 180) // 6) + 1
-    crs = CRS.from_epsg((32600 if world.origin.latitude_deg >= 0 else 32700) + zone)
+    crs = utm_zone(world.origin.latitude_deg, world.origin.longitude_deg)
     scene = _Scene(world, spec, cache, crs)
     middle = Transformer.from_crs(CRS.from_epsg(4326), crs, always_xy=True).transform(
         world.origin.longitude_deg, world.origin.latitude_deg

@@ -16,6 +16,7 @@ from sitl.errors import SimulationError
 
 VehicleChoice = Literal["auto", "ardupilot", "embedded"]
 Shift = Annotated[float, Field(ge=0, le=50)]
+Condition = Literal["day", "dusk", "night", "fog", "rain", "snow"]
 Injection = Literal["vision_position_estimate", "odometry", "gps_input"]
 
 
@@ -154,7 +155,7 @@ class Scenario(StrictModel):
     )
     camera: CameraSpec = CameraSpec()
     errors: ErrorSpec = ErrorSpec()
-    condition: Literal["day", "dusk", "night", "fog", "rain", "snow"] = "day"
+    condition: Condition = "day"
     land: bool = Field(False, description="at home, on vision alone, before the flight ends")
     cars: int = Field(30, ge=1, le=2000)
     people: int = Field(40, ge=0, le=2000)

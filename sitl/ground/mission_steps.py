@@ -24,17 +24,11 @@ def takeoff_step(height_m: float) -> MissionStep:
     return MissionStep(mavlink.MAV_CMD_NAV_TAKEOFF, altitude_m=height_m)
 
 
-def waypoint_step(
-    latitude_deg: float, longitude_deg: float, height_m: float, hold_s: float = 0.0
-) -> MissionStep:
-    """Item: fly to a position at a height above home, and stay hold_s."""
-    return MissionStep(
-        mavlink.MAV_CMD_NAV_WAYPOINT,
-        (hold_s, 0.0, 0.0, 0.0),
-        latitude_deg,
-        longitude_deg,
-        height_m,
-    )
+def waypoint_step(latitude_deg: float, longitude_deg: float, height_m: float) -> MissionStep:
+    """Item: fly to a position at a height above home."""
+    nothing = (0.0, 0.0, 0.0, 0.0)
+    place = (latitude_deg, longitude_deg, height_m)
+    return MissionStep(mavlink.MAV_CMD_NAV_WAYPOINT, nothing, *place)
 
 
 def speed_step(speed_m_s: float) -> MissionStep:

@@ -20,7 +20,6 @@ from sitl.ground.mission_client import MissionClient
 from sitl.ground.vehicle_record import AUTOPILOT, MODES, PX4_MODES, VEHICLE
 
 _GUIDED_POSITION = 0xDF8  # position only
-_GIMBAL_YAW_LOCK = 16.0
 _SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 
 
@@ -192,18 +191,14 @@ class Pilot:
         )
         return self.record.origin
 
-    def point_gimbal(self, pitch_deg: float, yaw_deg: float, *, earth_yaw: bool = False) -> None:
-        """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; pitch up positive, yaw from nose or north
-        (earth_yaw).
-        """
-        flags = _GIMBAL_YAW_LOCK if earth_yaw else 0.0
+    def point_gimbal(self, pitch_deg: float, yaw_deg: float) -> None:
+        """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; pitch up positive, yaw from the nose."""
         self.link.command(
             mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
             pitch_deg,
             yaw_deg,
             math.nan,
             math.nan,
-            flags,
         )
 
     def start_mission(self) -> None:

@@ -55,7 +55,6 @@ class AccuracyExpectation(_Span):
     within_percent: float = Field(25.0, gt=0)
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if len(errors) < 100:
             return ExpectationResult(False, f"only {len(errors)} EKF positions")
@@ -72,7 +71,6 @@ class MedianExpectation(_Span):
     metres: float
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
             return ExpectationResult(False, "no EKF positions")
@@ -88,7 +86,6 @@ class MaxErrorExpectation(_Span):
     at_most: float = FOREVER
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         errors = record.horizontal(self.from_s, self.to_s)
         if not len(errors):
             return ExpectationResult(False, "no EKF positions")
@@ -110,7 +107,6 @@ class JumpExpectation(_Expectation):
     overshoot_m: float = 2.0
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         begin = self.at_s + self.settled_s
         there = record.north(begin, begin + 2.0)
         whole = record.north(self.at_s, begin + 2.0)
@@ -135,7 +131,6 @@ class RefusedJumpExpectation(_Expectation):
     before_s: float
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         taken = [
             t - self.at_s
             for t, north, _ in record.errors
@@ -158,7 +153,6 @@ class TextExpectation(_Span):
     absent: bool = False
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         times = [
             t.at_s
             for t in record.texts
@@ -179,7 +173,6 @@ class AlertExpectation(_Span):
     absent: bool = False
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         return self.evaluate_texts(record.texts)
 
     def evaluate_texts(self, texts: Iterable[Text]) -> ExpectationResult:
@@ -204,7 +197,6 @@ class ErrorAlertExpectation(_Span):
     within_s: float = Field(ge=0)
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         beyond = [
             t
             for t, north, east in record.errors
@@ -229,7 +221,6 @@ class NoWarningExpectation(_Span):
     words: tuple[str, ...] = ("EKF variance", "Failsafe", "rror", "ailed", "litch", "nhealthy")
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         heard = [
             t.text
             for t in record.texts
@@ -248,7 +239,6 @@ class ModeExpectation(_Expectation):
     at_s: float | None = None
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         sample = record.at(FOREVER if self.at_s is None else self.at_s)
         mode = sample.mode if sample else "none"
         when = "at the end" if self.at_s is None else f"at {self.at_s:g} s"
@@ -262,7 +252,6 @@ class MovementExpectation(_Span):
     at_most: float
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
             return ExpectationResult(False, "no samples")
@@ -283,7 +272,6 @@ class InjectionExpectation(_Span):
     at_most: float = FOREVER
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
         if not inside:
             return ExpectationResult(False, "no samples")
@@ -308,7 +296,6 @@ class SourceSetExpectation(_Expectation):
     by_s: float
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         reached = [
             s.at_s for s in record.samples if s.at_s >= self.from_s and s.source_set == self.number
         ]
@@ -325,7 +312,6 @@ class ArmingRefusedExpectation(_Expectation):
     any_of: tuple[str, ...]
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         if record.refusals is None:
             return ExpectationResult(False, "arming was accepted")
         told = "; ".join(record.refusals) or "without a text"
@@ -339,7 +325,6 @@ class DoctorExpectation(_Expectation):
     finds: tuple[str, ...]
 
     def evaluate(self, record: CaseRecord) -> ExpectationResult:
-        """See `_Expectation.evaluate`."""
         d = record.doctor
         if d is None:
             return ExpectationResult(False, "the doctor was not asked")

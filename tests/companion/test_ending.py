@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import PriorConfig, RecordConfig, TargetConfig
+from companion.config import RecordConfig, TargetConfig
 from companion.conversions import CameraExtrinsics
 from companion.ending import wait_for_end
 from companion.flight.last_fix import FixMemory
@@ -85,7 +85,7 @@ def test_a_last_fix_on_a_dead_disk_is_left_there(hang, tmp_path, monkeypatch):
     path = tmp_path / "last-fix.json"
     path.write_text("{}")
     extrinsics = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
-    memory = FixMemory(path, PriorConfig(), autopilot, extrinsics, hang)
+    memory = FixMemory(path, autopilot, extrinsics, hang)
     bundle: Any = None
     memory.start()
     memory.add_estimate(TRACKED, bundle)

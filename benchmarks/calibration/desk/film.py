@@ -102,9 +102,7 @@ def write_record(
     try:
         arm = np.array(config.camera.lever_arm_m)
         geoid_m = stack.cache.manifest.geoid_separation_m
-        pose = AutopilotPose(
-            autopilot, CameraExtrinsics(stack.cache.frame, geoid_m, arm), config.prior
-        )
+        pose = AutopilotPose(autopilot, CameraExtrinsics(stack.cache.frame, geoid_m, arm))
         localizer = build_localizer(stack, told, config.localizer, pose.sensors)
         for exposed in pictures:
             time_ns = exposed.frame.exposure_time_ns - late_ns

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.shared_options import Record, RecordMap, RecordTlog
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count
@@ -22,11 +23,9 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.command("flight")
 def flight_command(
-    record: Annotated[Path, typer.Argument(help="folder that `companion run` recorded")],
-    tlog: Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")] = None,
-    map_cache: Annotated[
-        Path | None, typer.Option("--map", help="instead of the record's map")
-    ] = None,
+    record: Record,
+    tlog: RecordTlog = None,
+    map_cache: RecordMap = None,
     frames: Annotated[int, typer.Option(min=20, max=2000, help="largest number of frames")] = 200,
     config: Annotated[
         Path | None, typer.Option(help="deployment file that the record was flown with")

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
+from companion.cli.before.shared_options import FieldOfView, FootageCamera, MountPitch
 from companion.terminal.steps import COMPILES, show_count
 from companion.writing import result_file, write_result
 

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from companion.cli.before.footage_options import FieldOfView, FootageCamera, MountPitch
+from companion.cli.before.shared_options import FieldOfView, FootageCamera, MountPitch, WorkingWidth
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, show_steps
 from companion.writing import make_folder, refuse_input
@@ -44,7 +44,7 @@ def try_command(
         int,
         typer.Option(min=0, max=2000, help="frames whose position is searched on the map"),
     ] = 20,
-    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
+    width: WorkingWidth = 320,
 ) -> None:
     """Try recorded footage over a map: verdict, report and deployment file.
 

@@ -17,7 +17,7 @@ from localizer.map.building.content import require_in_volumes, require_upright
 from localizer.map.building.heights import extent_warnings, heights_of
 from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
-from localizer.map.building.sources import SourceOptions, find_source, read_source
+from localizer.map.building.sources import find_source, read_source
 from localizer.map.building.staging import TileRecord, publish, staging, write_index
 from localizer.map.building.workers import ImportJob, ImportWorkers, Progress, import_all, tiles_of
 from localizer.map.cache.cache import Manifest
@@ -51,21 +51,20 @@ def build_cache(
     options = options or BuildOptions()
     given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     sources, georeference = find_source(given, options.georeference)
-    reading = SourceOptions(options.up_axis, options.height_unit, options.nodata, options.rules)
     named = name or " ".join(map(str, sources))
     if options.is_apart:
         what = f"{named}: its reading"
         flat = call_in_process(
-            _read_flat, sources, georeference, reading, rules=options.rules, what=what
+            _read_flat, sources, georeference, options, rules=options.rules, what=what
         )
         tree = flat.tree()
     else:
-        tree = read_source(sources, georeference, reading)
+        tree = read_source(sources, georeference, options)
     return build_tree(tree, out, named, options, progress=progress)
 
 
 def _read_flat(
-    sources: Sequence[Path], georeference: Georeference | Path | None, options: SourceOptions
+    sources: Sequence[Path], georeference: Georeference | Path | None, options: BuildOptions
 ) -> FlatTree:
     return FlatTree.of(read_source(sources, georeference, options))
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.map.building.levels import with_levels
+from localizer.map.building.options import BuildOptions
 from localizer.map.building.quadtree import bounds, quadtree
 from localizer.map.importers.folder import MESHES, RASTERS, FoundSource, source_in
 from localizer.map.importers.georeference import Georeference, UpAxis, read_georeference
 from localizer.map.importers.mesh import MeshFile, obj_materials
 from localizer.map.importers.raster import read_rasters
 from localizer.map.importers.referenced_files import files_beside
-from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
+from localizer.map.importers.rules import require_plain_file
 from localizer.map.importers.tiles3d import read_tileset
 from localizer.map.source import SourceTree
 
@@ -24,18 +24,6 @@ _IMPORTABLE = (
     "3D Tiles (tileset.json or its folder), an OpenDroneMap result folder, a mesh "
     "(.glb, .gltf, .obj) with a georeference, or a DSM and an orthophoto (GeoTIFF)"
 )
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """Reading options for values that a source does not state. up_axis: of meshes; height_unit,
-    nodata: of a DSM, see `read_rasters`.
-    """
-
-    up_axis: UpAxis | None = None
-    height_unit: str | None = None
-    nodata: float | None = None
-    rules: ImportRules = DEFAULT_RULES
 
 
 def find_source(
@@ -58,12 +46,12 @@ def find_source(
 def read_source(
     sources: Sequence[Path],
     georeference: Georeference | Path | None = None,
-    options: SourceOptions | None = None,
+    options: BuildOptions | None = None,
 ) -> SourceTree:
-    """The tile tree of what `find_source` found. georeference: of a mesh. `MapSourceError` if it
-    cannot be imported.
+    """The tile tree of what `find_source` found. georeference: of a mesh, instead of that of the
+    options. `MapSourceError` if it cannot be imported.
     """
-    options = options or SourceOptions()
+    options = options or BuildOptions()
     rules = options.rules
     if all(path.suffix.lower() in RASTERS for path in sources):
         return read_rasters(sources, rules, height_unit=options.height_unit, nodata=options.nodata)
@@ -77,7 +65,7 @@ def read_source(
 
 
 def _read_mesh(
-    source: Path, georeference: Georeference | Path | None, options: SourceOptions
+    source: Path, georeference: Georeference | Path | None, options: BuildOptions
 ) -> SourceTree:
     if georeference is None:
         raise GeoreferenceError(
@@ -90,7 +78,7 @@ def _read_mesh(
     return mesh_tree(source, georeference, options)
 
 
-def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) -> SourceTree:
+def mesh_tree(path: Path, georeference: Georeference, options: BuildOptions) -> SourceTree:
     """The tree of a mesh. Default up axis: y for glTF, z for OBJ."""
     axis: UpAxis = options.up_axis or ("z" if path.suffix.lower() == ".obj" else "y")
     model = MeshFile(path, axis, georeference, options.rules)

@@ -117,6 +117,16 @@ class TileIndex:
         if not ok:
             raise MapCacheError("the tile index contradicts itself; build the cache again")
 
+    def tiles_of(self, node: int) -> range:
+        """A node's tiles."""
+        start = int(self.tile_start[node])
+        return range(start, start + int(self.tile_count[node]))
+
+    @property
+    def leaves(self) -> NDArray[np.intp]:
+        """The finest nodes with tiles."""
+        return np.flatnonzero((self.child_count == 0) & (self.tile_count > 0))
+
     def save(self, path: Path) -> str:
         """Write to `path`; returns the SHA-256 of the file."""
         arrays = {k: np.ascontiguousarray(v) for k, v in vars(self).items()}

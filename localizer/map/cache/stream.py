@@ -267,10 +267,8 @@ def _held(cache: TileCache) -> CacheLock:
 
 
 def _load(cache: TileCache, node: int) -> list[TileMesh] | MapCacheError:
-    start = int(cache.index.tile_start[node])
     try:
-        tiles = range(start, start + int(cache.index.tile_count[node]))
-        return [_ready(cache.load_tile(t)) for t in tiles]
+        return [_ready(cache.load_tile(t)) for t in cache.index.tiles_of(node)]
     except MapCacheError as error:
         return error
     except Exception as error:  # or nothing would be loaded ever again

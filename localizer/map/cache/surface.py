@@ -89,10 +89,8 @@ class MapSurface:
         return np.asarray(np.linalg.norm(gap, axis=1))
 
     def _load(self, node: int) -> list[TileMesh]:
-        start = int(self._cache.index.tile_start[node])
-        tiles = range(start, start + int(self._cache.index.tile_count[node]))
         with self._lock:
-            return [self._tile(t) for t in tiles]
+            return [self._tile(t) for t in self._cache.index.tiles_of(node)]
 
     def _tile(self, tile: int) -> TileMesh:
         """A tile's mesh from memory or disk. The caller holds the lock."""

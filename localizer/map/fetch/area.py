@@ -102,10 +102,3 @@ def area_around(points: Array, margin_m: float) -> Area:
             corners.append((lon, lat))
     lon, lat = np.array(corners).T
     return Area(float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max()))
-
-
-def utm_zone(area: Area) -> CRS:
-    """The UTM zone of the area's centre."""
-    latitude, longitude = area.centre
-    base = 32600 if latitude >= 0 else 32700
-    return CRS.from_epsg(base + int((longitude + 180) // 6) % 60 + 1)

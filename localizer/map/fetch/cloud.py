@@ -24,11 +24,12 @@ from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
 from localizer.errors import MapFetchError
-from localizer.map.fetch.area import Area, utm_zone
+from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.heights import UNITS, metres_of
 from localizer.map.fetch.http_client import HttpClient, safe_url
 from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, grid_over, split_grid
+from localizer.map.importers.height_crs import flat_crs, utm_zone
 from localizer.map.importers.raster_file import offline
 
 NODATA = -32768.0
@@ -188,9 +189,9 @@ def _grid_of(
 ) -> FetchGrid:
     """The grid: the first file's CRS if in metres; its pixels if of the wished size."""
     crs, transform = _lie_of(files[0], client)
-    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    flat = flat_crs(crs)
     if flat.is_geographic:
-        utm = utm_zone(area)
+        utm = utm_zone(*area.centre)
         return grid_over(area.bounds_in(utm), (resolution_m, resolution_m), utm)
     unit = float(flat.axis_info[0].unit_conversion_factor)
     own = abs(transform.a), abs(transform.e)
@@ -300,15 +301,13 @@ def _of_file(
 
 
 def _warped(data: Any, window: FetchGrid, how: Resampling, source: CatalogueSource) -> WarpedVRT:
-    own = CRS(data.crs)
-    flat = own.sub_crs_list[0] if own.is_compound else own
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = {"src_crs": flat_crs(CRS(data.crs)).to_wkt()}
     if source.nodata is not None:
-        options = {"src_nodata": source.nodata, "nodata": source.nodata}
+        options |= {"src_nodata": source.nodata, "nodata": source.nodata}
     elif data.nodata is None:
-        options = {"add_alpha": True}
+        options["add_alpha"] = True
     return WarpedVRT(
-        data, src_crs=flat.to_wkt(), crs=window.crs.to_wkt(), transform=window.transform,
+        data, crs=window.crs.to_wkt(), transform=window.transform,
         width=window.width, height=window.height, resampling=how, tolerance=0.01, **options,
     )  # fmt: skip
 

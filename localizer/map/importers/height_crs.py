@@ -149,9 +149,21 @@ def _geo_keys(file: BinaryIO) -> dict[int, int]:
     return {}
 
 
+def flat_crs(crs: CRS) -> CRS:
+    """A CRS's horizontal part. The importer converts heights itself, so GDAL must not."""
+    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    return flat.to_2d() if len(flat.axis_info) == 3 else flat
+
+
+def utm_zone(latitude_deg: float, longitude_deg: float) -> CRS:
+    """The UTM zone of a position."""
+    base = 32600 if latitude_deg >= 0 else 32700
+    return CRS.from_epsg(base + int((longitude_deg + 180) // 6) % 60 + 1)
+
+
 def horizontal_unit_m(crs: CRS) -> float:
     """Metres per unit of a projected CRS; 1 for degrees."""
-    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    flat = flat_crs(crs)
     return float(flat.axis_info[0].unit_conversion_factor) if flat.is_projected else 1.0
 
 
@@ -159,7 +171,7 @@ def far_outside(crs: CRS, lon: Array, lat: Array) -> str | None:
     """Warning if positions (N,), degrees, are far outside a CRS's area of use, for example because
     easting and northing are swapped; None otherwise.
     """
-    flat = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
+    flat = flat_crs(crs)
     area = flat.area_of_use
     if area is None and (epsg := flat.to_epsg()) is not None:
         area = CRS.from_epsg(epsg).area_of_use
@@ -185,7 +197,7 @@ def datum_doubt(crs: CRS, lon: float, lat: float) -> str | None:
     An older national datum needs a grid that may not be installed; without it a map is silently
     metres off (EPSG:27700: 2 to 21 m, NAD27: 8 to 20 m).
     """
-    flat = (crs.sub_crs_list[0] if crs.is_compound else crs).to_2d()
+    flat = flat_crs(crs)
     area = AreaOfInterest(lon - 0.01, lat - 0.01, lon + 0.01, lat + 0.01)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that a grid is missing is said here

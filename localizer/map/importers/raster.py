@@ -29,9 +29,7 @@ from rasterio.vrt import WarpedVRT
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
 from localizer.map.importers.georeference import ecef_from_crs
-from localizer.map.importers.height_crs import (
-    stated_heights,
-)
+from localizer.map.importers.height_crs import flat_crs, stated_heights, utm_zone
 from localizer.map.importers.heightmesh import ERROR_PER_STEP, height_mesh
 from localizer.map.importers.raster_checks import (
     check_colours,
@@ -215,7 +213,9 @@ def _read_rasters(
         date, sensor = stated_imagery(colours)
         grid = _grid(heights, colours)
         centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
-        bounds = rasterio.warp.transform_bounds(_flat_crs(heights), grid.crs, *heights.bounds)
+        bounds = rasterio.warp.transform_bounds(
+            flat_crs(CRS(heights.crs)), grid.crs, *heights.bounds
+        )
         left, right = sorted(bounds[::2])
         bottom, top = sorted(bounds[1::2])
         # With what lies beside them: world files, statistics, overviews, masks.
@@ -306,13 +306,13 @@ def _kind(data: DatasetReader) -> str:
 
 def _grid(dsm: DatasetReader, ortho: DatasetReader) -> HeightGrid:
     crs = _metric_crs(dsm)
-    if _flat_crs(dsm) == crs and not dsm.transform.b and not dsm.transform.d:
+    if flat_crs(CRS(dsm.crs)) == crs and not dsm.transform.b and not dsm.transform.d:
         step = abs(dsm.transform.a), abs(dsm.transform.e)
         left, right = sorted((dsm.bounds.left, dsm.bounds.right))  # rows may run northwards
         bottom, top = sorted((dsm.bounds.bottom, dsm.bounds.top))
     else:
         transform, width, height = rasterio.warp.calculate_default_transform(
-            _flat_crs(dsm), crs.to_wkt(), dsm.width, dsm.height, *dsm.bounds
+            flat_crs(CRS(dsm.crs)), crs.to_wkt(), dsm.width, dsm.height, *dsm.bounds
         )
         step = abs(transform.a), abs(transform.e)
         left, top = transform.c, transform.f
@@ -325,21 +325,14 @@ def _grid(dsm: DatasetReader, ortho: DatasetReader) -> HeightGrid:
     return HeightGrid(crs.to_wkt(), left + step[0] / 2, top - step[1] / 2, step, cells, levels)
 
 
-def _flat_crs(data: DatasetReader) -> CRS:
-    """A raster's horizontal CRS. The importer converts heights itself, so GDAL must not."""
-    own = CRS(data.crs)
-    flat = own.sub_crs_list[0] if own.is_compound else own
-    return flat.to_2d() if len(flat.axis_info) == 3 else flat
-
-
 def _metric_crs(data: DatasetReader) -> CRS:
     """The raster's horizontal CRS if it is in metres, otherwise the UTM zone of its centre."""
-    flat = _flat_crs(data)
+    flat = flat_crs(CRS(data.crs))
     metric = all(axis.unit_name in ("metre", "meter", "m") for axis in flat.axis_info[:2])
     if flat.is_projected and metric:
         return flat
     lon, lat = _centre(data, "EPSG:4326")
-    return CRS.from_epsg((32600 if lat >= 0 else 32700) + int((lon + 180) // 6) % 60 + 1)
+    return utm_zone(lat, lon)
 
 
 def _centre(data: DatasetReader, crs: str) -> tuple[float, float]:
@@ -351,7 +344,7 @@ def _centre(data: DatasetReader, crs: str) -> tuple[float, float]:
 
 def _texel_size(ortho: DatasetReader, crs: CRS) -> float:
     transform, _, _ = rasterio.warp.calculate_default_transform(
-        _flat_crs(ortho), crs.to_wkt(), ortho.width, ortho.height, *ortho.bounds
+        flat_crs(CRS(ortho.crs)), crs.to_wkt(), ortho.width, ortho.height, *ortho.bounds
     )
     return float(math.sqrt(abs(transform.a * transform.e)))
 
@@ -377,7 +370,7 @@ def _warped(
 ) -> Iterator[WarpedVRT]:
     """Context manager: a raster resampled to a square grid. missing: the user's nodata value."""
     data = open_cached(path)
-    flat = _flat_crs(data)
+    flat = flat_crs(CRS(data.crs))
     same = flat == CRS(crs)
     own = data.crs if flat == CRS(data.crs) else flat.to_wkt()
     # Beside a file that does not say what is missing GDAL's warper leaves zeros: a turned DSM got

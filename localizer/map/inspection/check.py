@@ -155,8 +155,7 @@ def find_seams(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
     index, rows, columns = cache.index, *mosaic.height.shape
     grey = mosaic.rgb.astype(np.float32).mean(axis=2)
     found = []
-    leaves = np.flatnonzero((index.child_count == 0) & (index.tile_count > 0))
-    for node in leaves:
+    for node in index.leaves:
         top, left = mosaic.pixel(float(index.box_min[node, 0]), float(index.box_max[node, 1]))
         bottom, right = mosaic.pixel(float(index.box_max[node, 0]), float(index.box_min[node, 1]))
         a, b = (round(np.clip(x, 0, rows)) for x in (top, bottom))
@@ -224,11 +223,7 @@ def _intact(cache: TileCache) -> list[MapFinding]:
     damaged: list[str] = []
     area: Array = np.zeros(3)
     index = cache.index
-    leaves = {
-        tile
-        for node in np.flatnonzero(index.child_count == 0)
-        for tile in range(index.tile_start[node], index.tile_start[node] + index.tile_count[node])
-    }
+    leaves = {tile for node in index.leaves for tile in index.tiles_of(node)}
     for number, tile in enumerate(cache.tile_ids):
         try:
             mesh = cache.load_geometry(tile)
@@ -371,9 +366,8 @@ def _shift(shift: ImageryOffset) -> MapFinding:
 
 def _leaf_gsd(cache: TileCache) -> NDArray[np.float64]:
     index = cache.index
-    leaves = (index.child_count == 0) & (index.tile_count > 0) & (index.gsd > 0)
-    gsd: NDArray[np.float64] = index.gsd[leaves]
-    return gsd
+    gsd: NDArray[np.float64] = index.gsd[index.leaves]
+    return gsd[gsd > 0]
 
 
 def _painted(

@@ -72,7 +72,7 @@ def levels(cache: TileCache) -> list[LevelSummary]:
     result = []
     for level in range(int(depth.max()) + 1):
         nodes = np.flatnonzero((depth == level) & (index.tile_count > 0))
-        tiles = [t for n in nodes for t in _tiles_of(cache, int(n))]
+        tiles = [t for n in nodes for t in index.tiles_of(int(n))]
         gsd = index.gsd[nodes]
         size = sum(cache.tile_path(t).stat().st_size for t in tiles if cache.tile_path(t).exists())
         result.append(
@@ -90,7 +90,7 @@ def levels(cache: TileCache) -> list[LevelSummary]:
 def verify(cache: TileCache) -> Verification:
     """Check every tile's hash, and find holes in the finest surface."""
     damaged: list[str] = []
-    leaf = set(_leaf_tiles(cache))
+    leaf = set(_cut(cache, None))
     seen = _Occupancy(cache)
     for tile in cache.tile_ids:
         try:
@@ -198,15 +198,6 @@ def _depths(cache: TileCache) -> NDArray[np.int32]:
     return depth
 
 
-def _tiles_of(cache: TileCache, node: int) -> range:
-    start = int(cache.index.tile_start[node])
-    return range(start, start + int(cache.index.tile_count[node]))
-
-
-def _leaf_tiles(cache: TileCache) -> Iterator[int]:
-    return _cut(cache, None)
-
-
 def _cut(cache: TileCache, level: int | None) -> Iterator[int]:
     """Tiles that show the surface once: at a depth of the tree, or (None) the finest."""
     index = cache.index
@@ -219,7 +210,7 @@ def _cut(cache: TileCache, level: int | None) -> Iterator[int]:
             ends_above = depth[node] < level and index.child_count[node] == 0
             taken = depth[node] == level or ends_above or (adds and depth[node] < level)
         if taken:
-            yield from _tiles_of(cache, node)
+            yield from index.tiles_of(node)
 
 
 class _Occupancy:

@@ -77,7 +77,7 @@ class _Sampler:
     def views(self, count: int, side_px: int, gsd_m: float) -> Iterator[tuple[Array, TopView]]:
         """The centre (2,), east and north m, of each square, and its view."""
         index = self.cache.index
-        leaves = np.flatnonzero((index.child_count == 0) & (index.tile_count > 0))
+        leaves = index.leaves
         spread = np.linspace(0, len(leaves) - 1, min(count, len(leaves)))
         chosen = leaves[spread.round().astype(int)]
         base_m = float(index.box_min[0, 2])

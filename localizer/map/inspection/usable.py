@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.geometry.antimeridian import lon_near, wrapped
+from localizer.geometry.antimeridian import GeoBox, lon_near, wrapped
 from localizer.geometry.geo import LocalFrame
 from localizer.map.inspection.mosaic import Mosaic
 
@@ -20,24 +20,18 @@ _RIM = 2  # cells of both sides: a ragged edge is no news
 
 @dataclass(frozen=True)
 class UsableArea:
-    """The largest rectangle without faults. south, west, north, east: degrees, inside it; size_m:
-    east and north; is_whole: it covers the map except for a margin of one cell.
+    """The largest rectangle without faults. box: inside it; size_m: east and north; is_whole: it
+    covers the map except for a margin of one cell.
     """
 
-    south: float
-    west: float
-    north: float
-    east: float
+    box: GeoBox
     size_m: tuple[float, float]
     is_whole: bool
 
     def line(self) -> str:
         """The area as text."""
         east_m, north_m = self.size_m
-        return (
-            f"latitude {self.south:.5f} to {self.north:.5f}, longitude {self.west:.5f} to "
-            f"{self.east:.5f} ({east_m:.0f} x {north_m:.0f} m)"
-        )
+        return f"{self.box.line()} ({east_m:.0f} x {north_m:.0f} m)"
 
 
 def usable_part(
@@ -64,10 +58,12 @@ def usable_part(
     about = frame.origin.longitude_deg
     beyond = [lon_near(p.longitude_deg, about) for p in places]  # in the same order
     return UsableArea(
-        max(south_west, south_east),
-        wrapped(max(beyond[0], beyond[2])),
-        min(north_west, north_east),
-        wrapped(min(beyond[1], beyond[3])),
+        GeoBox(
+            max(south_west, south_east),
+            wrapped(max(beyond[0], beyond[2])),
+            min(north_west, north_east),
+            wrapped(min(beyond[1], beyond[3])),
+        ),
         ((right - left) * mosaic.gsd_m, (bottom - top) * mosaic.gsd_m),
         found[1] - found[0] >= h - _RIM and found[3] - found[2] >= w - _RIM,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
-from localizer.registration.backend import LevelProblem, LMSettings, Refinement
+from localizer.registration.backend import LevelProblem, LMSettings, QuadraticPrior, Refinement
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.compiler import Image, compile_kernels
 from localizer.registration.cuda.driver import Arena, Device, Kernels
@@ -110,7 +110,7 @@ class CudaBackend:
         arguments["level"] = put("level", level)
         arguments["state"] = put("state", state)
         if problem.prior is not None:
-            arguments["prior"] = put("prior", packed_prior(problem))
+            arguments["prior"] = put("prior", packed_prior(problem.prior))
         arguments["swarm"] = (
             put("rotations", np.ascontiguousarray(rotations, dtype=np.float64)),
             put("translations", np.ascontiguousarray(translations, dtype=np.float64)),
@@ -133,14 +133,13 @@ def set_loss(arguments: NDArray[np.void], settings: LMSettings, iterations: int)
     arguments["iterations"] = iterations
 
 
-def packed_prior(problem: LevelProblem) -> NDArray[np.void]:
-    """The problem's prior as the kernels' structure."""
+def packed_prior(prior: QuadraticPrior) -> NDArray[np.void]:
+    """A prior as the kernels' structure."""
     packed = np.zeros((), dtype=layout.PRIOR)
-    if problem.prior is not None:
-        packed["rotation"] = problem.prior.camera_from_local.rotation
-        packed["translation"] = problem.prior.camera_from_local.translation
-        packed["information"] = problem.prior.information
-        packed["weight"] = problem.prior.weight
+    packed["rotation"] = prior.camera_from_local.rotation
+    packed["translation"] = prior.camera_from_local.translation
+    packed["information"] = prior.information
+    packed["weight"] = prior.weight
     return packed
 
 

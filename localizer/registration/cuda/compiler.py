@@ -33,41 +33,25 @@ class Image:
     log: str
 
 
-def cache_directory() -> Path:
-    """Folder of compiled images, which may not exist: "cuda" in PILOT_CACHE or the user's cache."""
-    return cache_folder("cuda")
-
-
 def compile_kernels(
     channels: int, architecture: tuple[int, int], cache: Path | None = None
 ) -> Image:
     """Compile the kernels for one channel count and compute capability, or load them from the cache
-    folder (None: `cache_directory`).
+    folder (None: "cuda" in PILOT_CACHE or the user's cache).
 
     If the cache cannot be written, the kernels are compiled at every start. Raises
     `CudaUnavailableError` without NVRTC, `CudaError` if it refuses the source.
     """
     sources = {path.name: path.read_text() for path in sorted(SOURCES.glob("*.cu*"))}
-    return compile_sources(sources, _MAIN, macros(channels), architecture, cache)
-
-
-def compile_sources(
-    sources: Mapping[str, str],
-    main: str,
-    defined: Mapping[str, int],
-    architecture: tuple[int, int],
-    cache: Path | None = None,
-) -> Image:
-    """As `compile_kernels` for any sources by name; `main` includes the others; defined: macros."""
     nvrtc = load_nvrtc()
     options = [f"--gpu-architecture=sm_{architecture[0]}{architecture[1]}", *_OPTIONS]
-    options += [f"-D{name}={value}" for name, value in defined.items()]
+    options += [f"-D{name}={value}" for name, value in macros(channels).items()]
     version = _checked(nvrtc, nvrtc.nvrtcVersion())
-    path = (cache or cache_directory()) / f"{_digest(sources, options, version)}.cubin"
+    path = (cache or cache_folder("cuda")) / f"{_digest(sources, options, version)}.cubin"
     try:
         return Image(path.read_bytes(), "")
     except OSError:
-        image = compile_image(nvrtc, sources, main, options)
+        image = compile_image(nvrtc, sources, options)
     _store(path, image.code)
     return image
 
@@ -88,18 +72,16 @@ def _store(path: Path, code: bytes) -> None:
         return
 
 
-def compile_image(
-    nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: list[str]
-) -> Image:
-    """Compile `main` with the others as headers, without the cache. `CudaError` with the compiler's
-    log if it fails.
+def compile_image(nvrtc: ModuleType, sources: Mapping[str, str], options: list[str]) -> Image:
+    """Compile the main source with the others as headers, without the cache. `CudaError` with the
+    compiler's log if it fails.
     """
-    headers = {name: text for name, text in sources.items() if name != main}
+    headers = {name: text for name, text in sources.items() if name != _MAIN}
     program = _checked(
         nvrtc,
         nvrtc.nvrtcCreateProgram(
-            sources[main].encode(),
-            main.encode(),
+            sources[_MAIN].encode(),
+            _MAIN.encode(),
             len(headers),
             [text.encode() for text in headers.values()],
             [name.encode() for name in headers],

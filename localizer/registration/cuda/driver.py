@@ -7,7 +7,6 @@ process can be read in place.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Any
@@ -56,14 +55,9 @@ class Device:
         """Free memory of `allocate`."""
         self._call(self._api.cuMemFree, address)
 
-    def pinned(self, size: int) -> NDArray[np.uint8]:
-        """Page-locked host memory for asynchronous copies; it lives as long as the process."""
-        address = int(self._call(self._api.cuMemAllocHost, max(size, 1)))
-        return np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(address))
-
     def upload(self, address: int, array: NDArray[Any]) -> None:
         """Queue a copy of a C-contiguous array to the device; ValueError for another layout. The
-        array may be changed at once, `pinned` memory only after `synchronize`.
+        array may be changed at once.
         """
         if not array.flags.c_contiguous:
             raise ValueError("only C-contiguous arrays can be copied to the device")

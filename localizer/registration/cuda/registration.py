@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import QuadraticPrior, camera_from_local, local_origin
 from localizer.registration.config import JNGOConfig
-from localizer.registration.covariance import CovarianceSums
 from localizer.registration.cpu.reference import prior_terms
 from localizer.registration.cuda.backend import CudaBackend
-from localizer.registration.cuda.schedule import CudaSchedule, DeviceSearchResult
+from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Registration, SearchSurvivors, failure, registration
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
@@ -46,10 +45,10 @@ class CudaRegistration:
         )  # fmt: skip
         if not search.finite:
             return failure(prior, RegistrationStatus.BAD_FEATURES)
-        if len(search.scores) == 0:
-            return failure(prior, RegistrationStatus.NO_OVERLAP, search.evaluations)
-        cell_px = config.correlation_px / query.levels[-1].stride
-        return registration(_found(search, local, cell_px), config, prior, origin)
+        found = search.survivors
+        if len(found.scores) == 0:
+            return failure(prior, RegistrationStatus.NO_OVERLAP, found.evaluations)
+        return registration(_with_prior(found, local), config, prior, origin)
 
 
 def _local_constraint(constraint: PoseConstraint | None, origin: Array) -> QuadraticPrior | None:
@@ -60,25 +59,9 @@ def _local_constraint(constraint: PoseConstraint | None, origin: Array) -> Quadr
     return QuadraticPrior(Pose(R[0], t[0]), constraint.information, 1.0)
 
 
-def _found(
-    search: DeviceSearchResult, constraint: QuadraticPrior | None, cell_px: float
-) -> SearchSurvivors:
-    prior_hessian, weight = np.zeros((6, 6)), 0.0
-    if constraint is not None:
-        weight = search.prior_weight
-        R, t = search.rotations[0], search.translations[0]
-        prior_hessian = weight * prior_terms(constraint, R, t)[1]
-    sums = CovarianceSums(
-        search.hessian, search.meat, search.isotropic, search.cells, cell_px,
-        prior_hessian, search.motion, search.anchors, search.share, search.curvature,
-    )  # fmt: skip
-    return SearchSurvivors(
-        search.rotations,
-        search.translations,
-        search.scores,
-        search.overlaps,
-        sums,
-        weight,
-        search.quality,
-        search.evaluations,
-    )
+def _with_prior(found: SearchSurvivors, constraint: QuadraticPrior | None) -> SearchSurvivors:
+    """The survivors with the constraint in their sums."""
+    if constraint is None or found.sums is None:
+        return replace(found, prior_weight=0.0)
+    _, hessian, _ = prior_terms(constraint, found.rotations[0], found.translations[0])
+    return replace(found, sums=replace(found.sums, prior_hessian=found.prior_weight * hessian))

@@ -23,9 +23,10 @@ from localizer.registration.backend import (
     level_intrinsics,
 )
 from localizer.registration.config import JNGOConfig
+from localizer.registration.covariance import CovarianceSums
 from localizer.registration.cpu.reference import count_in_view
 from localizer.registration.cuda import layout
-from localizer.registration.cuda.backend import CudaBackend, as_floats
+from localizer.registration.cuda.backend import CudaBackend, as_floats, packed_prior
 from localizer.registration.cuda.curvature import (
     last_settings,
     level_without_features,
@@ -42,36 +43,21 @@ from localizer.registration.cuda.steps import (
     launches,
     refine_launch,
 )
+from localizer.registration.result import SearchSurvivors
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
 
 @dataclass(frozen=True)
 class DeviceSearchResult:
-    """Results from the device. rotations (K, 3, 3), translations (K, 3): survivors,
-    camera_from_local, best first, the first one sharpened; scores (K,) before that, and overlaps
-    (K,); K is 0 without overlap. hessian to curvature: as in `CovarianceSums`; finite: False if
-    features, confidences or points are not finite. upload_ms, graph_ms: device time, 0 unless
-    timed.
+    """Results from the device. survivors: their sums are without the prior; none without overlap.
+    finite: False if features, confidences or points are not finite. upload_ms, graph_ms: device
+    time, 0 unless timed.
     """
 
-    rotations: Array
-    translations: Array
-    scores: Array
-    overlaps: Array
-    hessian: Array
-    meat: Array
-    isotropic: Array
-    cells: int
-    motion: Array
-    anchors: int
-    share: float
-    curvature: float
-    prior_weight: float
-    quality: float
-    evaluations: int
+    survivors: SearchSurvivors
     finite: bool
-    upload_ms: float
-    graph_ms: float
+    upload_ms: float = 0.0
+    graph_ms: float = 0.0
 
 
 class CudaSchedule:
@@ -117,29 +103,33 @@ class CudaSchedule:
             if self._timed:
                 events.append(self._device.event())
             last = len(channels) - 1 if config.sharpen else len(config.iterations) - 1
-            found, scale = self._collect(memory, config, len(anchors.points_world), channels[last])
-            if len(found.scores) > 0 and found.finite:
+            count = len(anchors.points_world)
+            result, sums, scale = self._collect(memory, config, count, channels[last], cell_px)
+            if len(result.survivors.scores) > 0 and result.finite:
                 points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
                 level = query.levels[last]
                 seen = level_without_features(
                     points, *level_intrinsics(camera, level), level.confidence.shape
                 )
-                found = self._with_curvature(found, shape, memory, last, seen, scale)
+                found = result.survivors
+                sums = self._with_curvature(found, sums, shape, memory, last, seen, scale)
+                result = replace(result, survivors=replace(found, sums=sums))
             if not self._timed:
-                return found
+                return result
             upload, run = (self._device.elapsed_ms(*events[k : k + 2]) for k in (0, 1))
-            return replace(found, upload_ms=upload, graph_ms=run)
+            return replace(result, upload_ms=upload, graph_ms=run)
 
     def _with_curvature(
         self,
-        found: DeviceSearchResult,
+        found: SearchSurvivors,
+        sums: CovarianceSums,
         shape: GraphShape,
         memory: FrameMemory,
         level: int,
         seen: LevelProblem,
         scale: float,
-    ) -> DeviceSearchResult:
-        """The result with motion, counts and curvature. seen: the level's geometry; scale: of its
+    ) -> CovarianceSums:
+        """The sums with motion, counts and curvature. seen: the level's geometry; scale: of its
         loss.
         """
         c = shape.config
@@ -153,12 +143,12 @@ class CudaSchedule:
             free=True,
         )  # fmt: skip
         curvature = winner_curvature(
-            self._backend, memory, step, shape.channels[level], pose, motion, found.hessian,
+            self._backend, memory, step, shape.channels[level], pose, motion, sums.hessian,
             c.curvature_px,
         )  # fmt: skip
         fitted = seen if c.sharpen else few
         return replace(
-            found,
+            sums,
             motion=motion,
             anchors=count_in_view(fitted, *pose),
             share=few.points.shape[1] / fitted.points.shape[1],
@@ -212,7 +202,7 @@ class CudaSchedule:
         if motion is not None and config.motion_weight > 0:
             memory.write(frame, memory.motion, _packed_motion(motion, origin, config))
         if constraint is not None:
-            memory.write(frame, memory.prior, _packed_prior(constraint))
+            memory.write(frame, memory.prior, packed_prior(replace(constraint, weight=0.0)))
         state = np.zeros((), dtype=layout.STATE)
         state["count"] = len(swarm[0])
         memory.write(frame, memory.state, state)
@@ -223,9 +213,9 @@ class CudaSchedule:
         self._device.upload(memory.base, frame)
 
     def _collect(
-        self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
-    ) -> tuple[DeviceSearchResult, float]:
-        """The download without motion, counts and curvature, and the last loss's scale."""
+        self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int, cell_px: float
+    ) -> tuple[DeviceSearchResult, CovarianceSums, float]:
+        """The download, its sums without motion, counts and curvature, and the last scale."""
         block = np.empty(memory.result_size, np.uint8)
         self._device.download(block, memory.prior)
         self._device.synchronize()
@@ -240,30 +230,30 @@ class CudaSchedule:
         state = read(memory.state, layout.STATE)
         count, swarm = int(state["count"]), memory.swarms[-1]
         taking_part = _taking_part(anchors, config.swarm_anchors[-1])
-        weight = read(memory.prior, layout.PRIOR)["weight"]
         total = max(float(state["total"]), 1e-30)
         variance = float(state["square_sum"]) / max(float(state["scale_sum"]), 1e-12) / channels
-        search = DeviceSearchResult(
-            read(int(swarm["rotations"]), np.float64, (count, 3, 3)).copy(),
-            read(int(swarm["translations"]), np.float64, (count, 3)).copy(),
-            read(int(swarm["scores"]), np.float64, (count,)).copy(),
-            read(int(swarm["visible"]), np.int32, (count,)) / taking_part,
+        sums = CovarianceSums(
             _symmetric(state["hessian"]) / total,
             _symmetric(state["meat"]) / total**2,
             _symmetric(state["isotropic"]) / total**2 * variance,
             int(state["cells"]),
-            np.zeros((6, 6)),
-            0,
-            1.0,
-            1.0,
-            float(weight),
+            cell_px,
+            prior_hessian=np.zeros((6, 6)),
+            motion=np.zeros((6, 6)),
+            anchors=0,
+        )
+        survivors = SearchSurvivors(
+            read(int(swarm["rotations"]), np.float64, (count, 3, 3)).copy(),
+            read(int(swarm["translations"]), np.float64, (count, 3)).copy(),
+            read(int(swarm["scores"]), np.float64, (count,)).copy(),
+            read(int(swarm["visible"]), np.int32, (count,)) / taking_part,
+            sums,
+            float(read(memory.prior, layout.PRIOR)["weight"]),
             float(state["quality"]),
             int(state["evaluations"]),
-            not int(state["not_finite"]),
-            0.0,
-            0.0,
         )
-        return search, float(state["scale"])
+        finite = not int(state["not_finite"])
+        return DeviceSearchResult(survivors, finite), sums, float(state["scale"])
 
 
 def _taking_part(total: int, wanted: int) -> int:
@@ -292,14 +282,6 @@ def _query_address(backend: CudaBackend, name: str, values: object) -> int:
     if isinstance(values, DeviceArray):
         return values.checked_address(np.float32)
     return backend.arena.put(name, as_floats(np.asarray(values)))
-
-
-def _packed_prior(constraint: QuadraticPrior) -> NDArray[np.void]:
-    packed = np.zeros((), dtype=layout.PRIOR)
-    packed["rotation"] = constraint.camera_from_local.rotation
-    packed["translation"] = constraint.camera_from_local.translation
-    packed["information"] = constraint.information
-    return packed
 
 
 def _packed_motion(motion: PosePrior, origin: Array, config: JNGOConfig) -> NDArray[np.void]:

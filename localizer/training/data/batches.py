@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from abc import ABC, abstractmethod
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,31 @@ class Schedule:
         return self.paths[int(rng.integers(count))]
 
 
-class ShardStream:
+class BatchStream(ABC):
+    """Makes the batches of a run, each while the step before is computed."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1)
+        self._next: tuple[int, Future[Batch]] | None = None
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step; a thread prepares the next one meanwhile."""
+        if self._next is not None and self._next[0] == step:
+            current = self._next[1]
+        else:
+            current = self._thread.submit(self._make, step)
+        self._next = (step + 1, self._thread.submit(self._make, step + 1))
+        return current.result()
+
+    def close(self) -> None:
+        """Stop preparing batches; does not wait."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    @abstractmethod
+    def _make(self, step: int) -> Batch: ...
+
+
+class ShardStream(BatchStream):
     """Makes batches from the shards that a schedule selects.
 
     A step waits until its shards exist. Training can therefore begin while later shards are still
@@ -77,27 +102,17 @@ class ShardStream:
         rank: int = 0,
         generating: Future[None] | None = None,
     ) -> None:
+        super().__init__()
         self._schedule, self._config = schedule, config
         self._generating = generating
         self._closed = threading.Event()
         self._seed = (seed,) if rank == 0 else (seed, rank)
-        self._cache: OrderedDict[Path, list[Pair]] = OrderedDict()
-        self._pool = ThreadPoolExecutor(1)
-        self._next: tuple[int, Future[Batch]] | None = None
-
-    def batch(self, step: int) -> Batch:
-        """The batch of a step; a thread prepares the next one meanwhile."""
-        if self._next is not None and self._next[0] == step:
-            current = self._next[1]
-        else:
-            current = self._pool.submit(self._make, step)
-        self._next = (step + 1, self._pool.submit(self._make, step + 1))
-        return current.result()
+        self._shard = lru_cache(config.cached_shards)(self._read)
 
     def close(self) -> None:
-        """Stop preparing batches."""
+        """See `BatchStream.close`; also stops waiting for a shard."""
         self._closed.set()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        super().close()
 
     def _make(self, step: int) -> Batch:
         rng = np.random.default_rng((*self._seed, step))
@@ -117,10 +132,7 @@ class ShardStream:
             "with `contact-sheet`"
         )
 
-    def _shard(self, path: Path) -> list[Pair]:
-        if path in self._cache:
-            self._cache.move_to_end(path)
-            return self._cache[path]
+    def _read(self, path: Path) -> list[Pair]:
         self._await(path)
         pairs = read_shard(path)
         width, height = self._config.crop
@@ -129,10 +141,7 @@ class ShardStream:
             raise SequenceError(
                 f"{path}: its images are {size}, less than `crop` asks: {width}x{height}"
             )
-        self._cache[path] = pairs
-        if len(self._cache) > self._config.cached_shards:
-            self._cache.popitem(last=False)
-        return self._cache[path]
+        return pairs
 
     def _await(self, path: Path) -> None:
         while not path.exists():
@@ -244,24 +253,12 @@ def collate(samples: list[TrainingSample]) -> Batch:
     images = np.stack([s.reference for s in samples] + [s.query for s in samples])
     # channels_last tensors corrupt memory in torch 2.13's CPU backward pass.
     pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2)))
-    stacked = [
-        torch.from_numpy(np.stack(a).astype(np.float32))
-        for a in zip(
-            *(
-                (
-                    s.points,
-                    s.reference_pixels,
-                    s.query_pixels,
-                    s.visible,
-                    s.query_from_reference,
-                    s.K_query,
-                )
-                for s in samples
-            ),
-            strict=True,
-        )
-    ]
-    return Batch(pixels.float() / 255.0, *stacked)
+    stacked = {
+        name: torch.from_numpy(np.stack([getattr(s, name) for s in samples]).astype(np.float32))
+        for name in Batch.__dataclass_fields__
+        if name != "images"
+    }
+    return Batch(pixels.float() / 255.0, **stacked)
 
 
 def _unoccluded(

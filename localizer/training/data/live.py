@@ -14,7 +14,13 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from localizer.training.data.batches import LoaderConfig, TrainingSample, collate, crop_pair
+from localizer.training.data.batches import (
+    BatchStream,
+    LoaderConfig,
+    TrainingSample,
+    collate,
+    crop_pair,
+)
 from localizer.training.data.lit_places import PlaceVisits, low_priority, make_place
 from localizer.training.data.pairs import SceneConfig, draw_views, render_pair
 from localizer.training.data.shards import PhotoSource
@@ -46,8 +52,8 @@ class LivePlan:
         return self.first_seed + (number * count + rank) % self.places
 
 
-class LiveStream:
-    """Makes batches like `training.data.batches.ShardStream`, from pairs rendered on demand."""
+class LiveStream(BatchStream):
+    """Makes batches like `ShardStream`, from pairs rendered on demand."""
 
     def __init__(  # noqa: PLR0913
         self,
@@ -61,6 +67,7 @@ class LiveStream:
         count: int = 1,
         workers: int = 1,
     ) -> None:
+        super().__init__()
         self._plan, self._scenes, self._photos = plan, scenes, photos
         self._loader, self._seed, self._rank, self._count = loader, seed, rank, count
         self._ahead = workers
@@ -69,21 +76,11 @@ class LiveStream:
         self._renderers = ThreadPoolExecutor(workers)
         self._coming: dict[int, Future[PlaceVisits]] = {}
         self._places: dict[int, PlaceVisits] = {}
-        self._thread = ThreadPoolExecutor(1)
-        self._next: tuple[int, Future[Batch]] | None = None
-
-    def batch(self, step: int) -> Batch:
-        """The batch of a step; a thread prepares the next one meanwhile."""
-        if self._next is not None and self._next[0] == step:
-            current = self._next[1]
-        else:
-            current = self._thread.submit(self._make, step)
-        self._next = (step + 1, self._thread.submit(self._make, step + 1))
-        return current.result()
 
     def close(self) -> None:
         """End the processes that make places, and the threads; does not wait for them."""
-        for pool in (self._thread, self._renderers, self._makers):
+        super().close()
+        for pool in (self._renderers, self._makers):
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _make(self, step: int) -> Batch:

@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 
 from localizer.training.config import DataSection, LiveSection, TrainConfig
-from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream
+from localizer.training.data.batches import BatchStream, LoaderConfig, Schedule, ShardStream
 from localizer.training.data.live import LivePlan, LiveStream
 from localizer.training.data.pairs import SceneConfig
 from localizer.training.data.seeds import FIRST_WORLD_SEED
@@ -16,7 +16,7 @@ from localizer.training.distributed import TrainingProcess
 
 def open_stream(
     config: TrainConfig, workers: TrainingProcess, generating: Future[None] | None
-) -> ShardStream | LiveStream:
+) -> BatchStream:
     """The batches of one process of a run. generating: writes missing shards meanwhile."""
     data, o = config.data, config.optimizer
     loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)

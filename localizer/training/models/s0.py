@@ -16,6 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from localizer.training.models.tiny import affine
+
 STRIDES = (4, 2, 1)
 _WIDTHS, _BLOCKS = (48, 48, 128), (1, 2, 8)
 _DECODER = (128, 64, 32)
@@ -73,13 +75,13 @@ class BranchedBlock(nn.Module):
         conv = nn.Conv2d(inputs, outputs, size, stride, size // 2, groups=groups)
         weight, bias = torch.zeros_like(conv.weight), torch.zeros(outputs)
         for branch in (*self.convolutions, *([self.point] if self.point is not None else [])):
-            gain, shift = _affine(branch[1])
+            gain, shift = affine(branch[1])
             folded = branch[0].weight * gain[:, None, None, None]
             margin = (size - folded.shape[-1]) // 2
             weight = weight + F.pad(folded, (margin, margin, margin, margin))
             bias = bias + shift
         if self.skip is not None:
-            gain, shift = _affine(self.skip)
+            gain, shift = affine(self.skip)
             index = torch.arange(outputs)
             identity = torch.zeros_like(weight)
             identity[index, index % (inputs // groups), size // 2, size // 2] = gain
@@ -152,7 +154,7 @@ def fuse(model: nn.Module) -> nn.Module:
     if isinstance(model, nn.Sequential) and len(model) > 1 and isinstance(model[1], nn.BatchNorm2d):
         conv, bn = model[0], model[1]
         assert isinstance(conv, nn.Conv2d)
-        gain, shift = _affine(bn)
+        gain, shift = affine(bn)
         folded = nn.Conv2d(conv.in_channels, conv.out_channels, 3, padding=1)
         folded.weight = nn.Parameter((conv.weight * gain[:, None, None, None]).detach().clone())
         folded.bias = nn.Parameter(shift.detach().clone())
@@ -171,11 +173,3 @@ def _unit(inputs: int, outputs: int, branches: int, stride: int) -> list[nn.Modu
 def _convolution(inputs: int, outputs: int) -> nn.Sequential:
     conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ReLU())
-
-
-def _affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
-    """Gain and shift (C,) that a batch normalisation applies in evaluation."""
-    assert bn.running_var is not None
-    assert bn.running_mean is not None
-    gain = bn.weight / torch.sqrt(bn.running_var + bn.eps)
-    return gain, bn.bias - bn.running_mean * gain

@@ -170,7 +170,7 @@ def _conv_bn(
     return nn.Sequential(conv, nn.BatchNorm2d(outputs))
 
 
-def _affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
+def affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
     """Gain and shift (C,) that a batch normalisation applies in evaluation."""
     assert bn.running_var is not None
     assert bn.running_mean is not None
@@ -179,7 +179,7 @@ def _affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
 
 
 def _folded(branch: nn.Sequential) -> tuple[Tensor, Tensor]:
-    gain, shift = _affine(branch[1])
+    gain, shift = affine(branch[1])
     return branch[0].weight * gain[:, None, None, None], shift
 
 

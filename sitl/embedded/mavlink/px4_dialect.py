@@ -27,7 +27,7 @@ _CAPABILITIES = 4 | 8 | 128 | 256 | _BYTEWISE | _MAVLINK2
 class Px4Telemetry(TelemetryBuilder):
     """HEARTBEAT, ESTIMATOR_STATUS and HIGHRES_IMU instead of ArduPilot's."""
 
-    _autopilot = _AUTOPILOT_PX4
+    _autopilot, _firmware, _capabilities = _AUTOPILOT_PX4, FIRMWARE_VERSION, _CAPABILITIES
 
     def __init__(self, vehicle: Aircraft) -> None:
         super().__init__(vehicle)
@@ -47,13 +47,6 @@ class Px4Telemetry(TelemetryBuilder):
         message.onboard_control_sensors_enabled &= ~_SENSOR_VISION
         message.onboard_control_sensors_health &= ~_SENSOR_VISION
         return message
-
-    def _version(self) -> Any:
-        major, minor, patch, kind = FIRMWARE_VERSION
-        version = major << 24 | minor << 16 | patch << 8 | kind
-        return mavlink.MAVLink_autopilot_version_message(
-            _CAPABILITIES, version, 0, 0, 0, b"embedded", b"\0" * 8, b"\0" * 8, 0, 0, 0
-        )
 
     def _estimator_status(self) -> Any:
         v = self._vehicle

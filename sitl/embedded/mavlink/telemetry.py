@@ -32,7 +32,7 @@ class TelemetryBuilder:
     Above 200 lines: one short method for each of its messages, and their table.
     """
 
-    _autopilot = _AUTOPILOT_ARDUPILOT
+    _autopilot, _firmware, _capabilities = _AUTOPILOT_ARDUPILOT, FIRMWARE_VERSION, _CAPABILITIES
 
     def __init__(self, vehicle: Aircraft) -> None:
         self._vehicle = vehicle
@@ -118,10 +118,10 @@ class TelemetryBuilder:
         )
 
     def _version(self) -> Any:
-        major, minor, patch, kind = FIRMWARE_VERSION
+        major, minor, patch, kind = self._firmware
         version = major << 24 | minor << 16 | patch << 8 | kind
         return mavlink.MAVLink_autopilot_version_message(
-            _CAPABILITIES, version, 0, 0, 0, b"embedded", b"\0" * 8, b"\0" * 8, 0, 0, 0
+            self._capabilities, version, 0, 0, 0, b"embedded", b"\0" * 8, b"\0" * 8, 0, 0, 0
         )
 
     # --- navigation --------------------------------------------------------------------------

@@ -270,8 +270,8 @@ class _LoopFlight:
         for name, value in event.vehicle.items():
             self._pilot.link.set_parameter(name, value)
         if event.picture is not None:
-            self._camera.fault(event.picture.fault)
-            self._later(event.picture.for_s, lambda: self._camera.fault(None))
+            self._camera.send(event.picture.fault)
+            self._later(event.picture.for_s, lambda: self._camera.send(None))
         if event.zoom is not None:
             self._zoom_to(event.zoom)
         self._ramp.begin(event, self._now_s)
@@ -317,7 +317,7 @@ class _LoopFlight:
         before = self._zooming.at(now_ns)
         end_ns = now_ns + round(zoom.over_s * 1e9)
         self._zooming = Zooming(before, zoom.to, now_ns, end_ns)
-        self._camera.zoom(self._zooming)
+        self._camera.send(self._zooming)
         if self._reporting is not None:
             self._reporting.set(self._zooming)
 

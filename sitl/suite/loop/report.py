@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from scipy.stats import binomtest
 
+from companion.writing import json_value
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.evaluation import LoopExpectationResult, LoopFigures
 from sitl.suite.runner import PACE_LIMIT, STALL_LIMIT_S
@@ -93,10 +94,8 @@ def as_data(rows: Sequence[LoopRow]) -> dict[str, Any]:
     """Rows as JSON data; NaN and infinity become None."""
     rate = false_alarm_rate(rows)
     flights = [asdict(row) | {"ok": row.ok, "slow": row.slow} for row in rows]
-    data = {"flights": flights, "false_alarms": None if rate is None else asdict(rate)}
-    finite = _finite(data)
-    assert isinstance(finite, dict)
-    return finite
+    alarms = None if rate is None else asdict(rate)
+    return {"flights": json_value(flights), "false_alarms": json_value(alarms)}
 
 
 def read_rows(path: Path) -> tuple[LoopRow, ...]:
@@ -159,13 +158,3 @@ def _cells(row: LoopRow) -> tuple[str, ...]:
         f"{flown.rate_hz:.1f}",
         "; ".join([*(missed or ["all"]), *listed]).replace("|", "/"),
     )
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

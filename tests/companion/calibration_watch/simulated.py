@@ -9,7 +9,6 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration_watch.config import CalibrationLimits
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.geometry import GIMBAL_FROM_CAMERA
@@ -91,10 +90,9 @@ class Flown:
     gnss: Callable[[float], bool] = lambda at_s: True
     pitch_deg: float = -45.0
     seed: int = 1
-    limits: CalibrationLimits = field(default_factory=CalibrationLimits)
 
     def __post_init__(self) -> None:
-        self.watch, self.track = CalibrationWatch(self.limits), InertialTrack()
+        self.watch, self.track = CalibrationWatch(), InertialTrack()
         self.found: list[tuple[float, CalibrationFigures]] = []
         self._rng = np.random.default_rng(self.seed)
         self._at_s = 0.0

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from companion.calibration_watch.map_offset import MapOffsetEstimator, Policy
-from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.position_checks import GnssCheck
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.alerts.alert import Alert
@@ -116,9 +115,7 @@ def test_an_applied_shift_creeps_in_stays_after_gnss_and_is_what_others_compare(
         connected=True, gps_fix_type=3, gps_latitude_deg=latitude, gps_longitude_deg=longitude,
         gps_h_accuracy_m=0.5, gps_time_ns=flight.fixes[3900].time_ns,
     )  # fmt: skip
-    apart = GnssCheck(IntegrityMonitorConfig()).read(
-        flight.fixes[3900], state, 0.0, state.gps_time_ns
-    )
+    apart = GnssCheck().read(flight.fixes[3900], state, 0.0, state.gps_time_ns)
     assert apart.figure < 1.2
 
 

@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.calibration_watch.config import CalibrationLimits
 from companion.calibration_watch.observation import CalibrationObservation
-from companion.calibration_watch.watch import CalibrationFigures
+from companion.calibration_watch.watch import BORESIGHT_DEG, FOCAL_SHARE, TIME_S, CalibrationFigures
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from tests.companion.calibration_watch.simulated import Flown, Wrong, square
 
-LIMITS = CalibrationLimits()
 SURVEYED = square(60.0)  # climbs to its height on GNSS, then turns
 DENIED = square(60.0, climb_s=0.0)
 
@@ -36,9 +34,9 @@ class Dragged(Flown):
 def findings(figures: CalibrationFigures) -> set[str]:
     """What is beyond its limit."""
     found = {
-        "focal": figures.focal.exceeds(LIMITS.focal_share),
-        "time": figures.late_s.exceeds(LIMITS.time_s),
-        "boresight": figures.boresight_deg.exceeds(LIMITS.boresight_deg),
+        "focal": figures.focal.exceeds(FOCAL_SHARE),
+        "time": figures.late_s.exceeds(TIME_S),
+        "boresight": figures.boresight_deg.exceeds(BORESIGHT_DEG),
     }
     return {name for name, is_found in found.items() if is_found}
 
@@ -119,7 +117,7 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
     soon = next(figures for at_s, figures in flown.found if at_s >= 25.0)
     for late in (soon.late_s, flown.found[-1][1].late_s):
         assert late.is_within(0.15) == (late_s == 0.0)
-        assert late.exceeds(LIMITS.time_s) == (late_s > 0.0)
+        assert late.exceeds(TIME_S) == (late_s > 0.0)
 
 
 @pytest.mark.parametrize(
@@ -263,8 +261,3 @@ def test_excluded_frames_do_not_bring_a_discarded_time_offset_back(since_s: floa
     before = next(figures for at_s, figures in flown.found if at_s >= 19.0)
     assert before.late_s.sigma < 0.1
     assert sigmas == pytest.approx([0.15], rel=0.05)  # as at a start
-
-
-def test_switched_off_it_says_nothing() -> None:
-    flown = Flown(Wrong(focal=0.05), square(30.0), limits=CalibrationLimits(enabled=False)).fly()
-    assert ever(flown) == set()

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
 from companion.flight.last_fix import FixMemory, LastFix, read_last_fix
 from companion.flight.priors import local_near
@@ -38,7 +37,7 @@ def kept(tmp_path: Path, fix: LastFix = BEGUN) -> Path:
 
 
 def memory(path: Path, local: tuple[float, float, float] | None = (13.0, 24.0, -85.0)) -> FixMemory:
-    return FixMemory(path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda _: local)
+    return FixMemory(path, AUTOPILOT, INSTALLATION, lambda _: local)
 
 
 def tracked(time_ns: int) -> PoseEstimate:
@@ -66,9 +65,7 @@ def test_a_picture_that_is_newer_than_the_ekf_report_can_be_placed(tmp_path, ahe
     )
     autopilot: Any = SimpleNamespace(state=lambda: state, local_at=lambda _: None)
     path = kept(tmp_path)
-    about = FixMemory(
-        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda t: local_near(autopilot, t)
-    )
+    about = FixMemory(path, AUTOPILOT, INSTALLATION, lambda t: local_near(autopilot, t))
     prior = about.prior(103 * SECOND + round(ahead_s * SECOND))
     assert (prior is not None) is usable
     if prior is not None:
@@ -99,7 +96,7 @@ def test_an_ekf_that_counts_from_elsewhere_shows_no_way(tmp_path, offset_ns, ori
     state = VehicleState(clock_offset_ns=offset_ns, origin=origin)
     path = kept(tmp_path, fix)
     again = FixMemory(
-        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda _: (13.0, 24.0, -85.0),
+        path, AUTOPILOT, INSTALLATION, lambda _: (13.0, 24.0, -85.0),
         state=lambda: state,
     )  # fmt: skip
     assert (again.prior(103 * SECOND) is not None) is usable
@@ -110,7 +107,7 @@ def test_where_the_ekf_counts_from_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "last-fix.json"
     state = VehicleState(clock_offset_ns=40 * SECOND, origin=ORIGIN)
     kept_on = FixMemory(
-        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda _: (1.0, 2.0, 3.0),
+        path, AUTOPILOT, INSTALLATION, lambda _: (1.0, 2.0, 3.0),
         state=lambda: state,
     )  # fmt: skip
     kept_on.start()

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import PriorConfig
 from companion.conversions import CameraExtrinsics
 from companion.flight.priors import AutopilotPose, PositionQualityMonitor
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -29,7 +28,7 @@ def with_gnss(at_s: float, accuracy_m: float = 1.0) -> VehicleState:
 
 
 def test_a_receiver_that_doubts_itself_is_believed_less() -> None:
-    belief = PositionQualityMonitor(PriorConfig()).at(with_gnss(10, accuracy_m=30.0), 10 * SECOND)
+    belief = PositionQualityMonitor().at(with_gnss(10, accuracy_m=30.0), 10 * SECOND)
     assert belief.sigma_m == pytest.approx(30.0)
 
 
@@ -48,17 +47,17 @@ def test_a_fix_that_never_went_to_the_ekf_holds_it_nowhere() -> None:
 
 def test_an_ekf_without_a_position_knows_nothing() -> None:
     blind = replace(FLYING, ekf_flags=1)  # EKF_ATTITUDE alone
-    assert PositionQualityMonitor(PriorConfig()).at(blind, 10 * SECOND).sigma_m is None
+    assert PositionQualityMonitor().at(blind, 10 * SECOND).sigma_m is None
 
 
 def test_a_position_of_unknown_origin_is_tried_but_no_evidence() -> None:
-    belief = PositionQualityMonitor(PriorConfig()).at(FLYING, 10 * SECOND)
+    belief = PositionQualityMonitor().at(FLYING, 10 * SECOND)
     assert belief.sigma_m == pytest.approx(25.0)
     assert not belief.independent
 
 
 def test_a_glitching_gnss_is_not_healthy() -> None:
-    beliefs = PositionQualityMonitor(PriorConfig())
+    beliefs = PositionQualityMonitor()
     state = replace(with_gnss(10), ekf_flags=8 | 16 | 32768)
     assert not beliefs.at(state, 10 * SECOND).independent
 
@@ -90,7 +89,7 @@ def test_an_ekf_that_follows_our_fixes_is_no_evidence_whatever_a_receiver_says_b
     """Its source set was vision's; the receiver that had been left for it went on to report a fix.
     Where it had dead reckoned to, the tracking began without a trial, and was searched within 15 m.
     """
-    pose = AutopilotPose(Placed(), INSTALLATION, PriorConfig(), lambda: on_gnss)
+    pose = AutopilotPose(Placed(), INSTALLATION, lambda: on_gnss)
     fix: Any = SimpleNamespace(accepted=True, exposure_time_ns=40 * SECOND)
     pose.add_estimate(fix, reaches_ekf=True)
     prior = pose.prior(100 * SECOND)
@@ -103,7 +102,7 @@ def test_an_ekf_on_gnss_begins_the_tracking_and_after_a_restart_where_they_agree
     """Who begins in the air does not know the source set, and the receiver knows the place."""
     placed = Placed()
     placed.apart_m = apart_m
-    prior = AutopilotPose(placed, INSTALLATION, PriorConfig(), lambda: on_gnss).prior(100 * SECOND)
+    prior = AutopilotPose(placed, INSTALLATION, lambda: on_gnss).prior(100 * SECOND)
     assert prior.independent
     assert prior.covariance[0, 0] == pytest.approx(25.0)
 
@@ -128,7 +127,7 @@ class Ranging:
 
 
 def autopilot_pose(lean_deg: float = 0.0) -> AutopilotPose:
-    return AutopilotPose(Ranging(lean_deg), INSTALLATION, PriorConfig())
+    return AutopilotPose(Ranging(lean_deg), INSTALLATION)
 
 
 def clearance(lean_deg: float, at_s: float) -> float | None:

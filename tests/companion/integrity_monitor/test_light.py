@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.integrity_monitor.config import VideoCheckConfig
-from companion.integrity_monitor.video import detail, thumbnail
+from companion.integrity_monitor.video import LOW_DETAIL, detail, thumbnail
 from companion.recorded.sequence import load_sequence
 from localizer.config import LocalizerConfig
 from localizer.geometry.pose import Pose
@@ -14,7 +13,7 @@ from localizer.tracking.opening import open_localizer
 from localizer.types import Frame, PosePrior
 from sitl.camera.faults import darken
 
-LIMIT = VideoCheckConfig().low_detail
+LIMIT = LOW_DETAIL
 
 
 def test_it_is_told_while_registrations_are_still_accepted(small_assets, small_sequence):

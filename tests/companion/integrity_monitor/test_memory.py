@@ -16,7 +16,6 @@ from companion.integrity_monitor.debouncer import InhibitMemory
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import CalibrationError
-from mavlink_bridge.injection.restart_memory import RestartMemory
 from mavlink_bridge.messages import VehicleState
 from tests.companion.integrity_monitor.simulated import Flight, monitor
 from tests.companion.integrity_monitor.test_checks import looking
@@ -25,17 +24,18 @@ LONG = {AlertId.FOCAL_LENGTH: (5.0, CalibrationError.LONG)}
 KEPT = {"focal_length": [5.0, "long"]}
 
 
-class Kept:
-    """A `RestartMemory` of this test."""
+class Kept(InhibitMemory):
+    """A memory without a file."""
 
     def __init__(self, found: object = None) -> None:
         self.told: Any = None if found is None else json.loads(json.dumps({"inhibits": found}))
 
-    def recall(self) -> tuple[dict[str, Any], float] | None:
+    def recall_state(self) -> tuple[dict[str, Any], float] | None:
+        self._kept = frozenset()  # a process that begins has stored nothing
         return None if self.told is None else (self.told, 4.0)
 
-    def store(self, told: dict[str, Any]) -> None:
-        self.told = json.loads(json.dumps(told))
+    def store_state(self, state: dict[str, Any]) -> None:
+        self.told = json.loads(json.dumps(state))
 
     def drop(self) -> None:
         self.told = None
@@ -56,9 +56,7 @@ def integrity_monitor(
         clear=inhibited.remove,
         inhibit=inhibited.append, gnss_place_at=lambda _: None,
     )  # fmt: skip
-    return IntegrityMonitor(
-        IntegrityMonitorConfig(), IntegrityLimits(), bridge, InhibitMemory(kept)
-    ), inhibited
+    return IntegrityMonitor(IntegrityMonitorConfig(), IntegrityLimits(), bridge, kept), inhibited
 
 
 def test_what_forbade_in_a_process_that_was_killed_forbids_from_the_start() -> None:
@@ -124,7 +122,7 @@ def test_without_evidence_it_stands() -> None:
     ],
 )  # fmt: skip
 def test_what_is_no_finding_that_forbids_is_none(found: object) -> None:
-    assert InhibitMemory(Kept(found)).recall() == {}  # type: ignore[arg-type]
+    assert Kept(found).recall() == {}
 
 
 def test_it_is_of_the_camera_and_the_map_that_flew(tmp_path: Path) -> None:
@@ -133,7 +131,7 @@ def test_it_is_of_the_camera_and_the_map_that_flew(tmp_path: Path) -> None:
     path.write_text(json.dumps({"inhibits": KEPT, "utc_s": time.time(), "about": "this camera"}))
     path.chmod(0o600)
     for about, found in (("another", {}), ("this camera", LONG)):
-        memory = RestartMemory(path, about=about)
-        assert InhibitMemory(memory).recall() == found
+        memory = InhibitMemory(path, about=about)
+        assert memory.recall() == found
         memory.stop(clean_shutdown=False)
     assert path.exists()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.config import IntegrityMonitorConfig
+from companion.integrity_monitor.step import UNREPORTED_JUMP_M
 from companion.integrity_monitor.tilt import TiltCheck
 from mavlink_bridge.alerts.catalogue import cleared
 from mavlink_bridge.alerts.ids import AlertId
@@ -102,7 +102,7 @@ def fixes(seed: int, constant_deg: float, wander_deg: float, seconds: int) -> It
 @pytest.mark.parametrize("seed", range(20))
 def test_a_gimbal_that_is_off_and_wanders_is_left_alone(seed: int) -> None:
     """Half a degree that stays and 0.3 that wander, per axis, drawn for 20 flights."""
-    check = TiltCheck(IntegrityMonitorConfig())
+    check = TiltCheck()
     for fix in fixes(seed, 0.5, 0.3, 60):
         check.add(fix, LEVEL)
         assert not check.tilts
@@ -153,10 +153,10 @@ def test_attitudes_that_are_missing_are_no_tilt() -> None:
 
 def test_a_tilt_at_an_unknown_height_is_widened() -> None:
     """A vehicle without a home says no height, and its position was taken to be right."""
-    check = TiltCheck(IntegrityMonitorConfig())
+    check = TiltCheck()
     for fix in fixes(1, 0.0, 0.0, 1):
         check.add(replace(fix, quaternion=from_euler(0.0, 0.1, 0.0)), LEVEL)
-    assert check.metres(None) == IntegrityMonitorConfig().unreported_jump_m
+    assert check.metres(None) == UNREPORTED_JUMP_M
     for fix in fixes(1, 0.5, 0.3, 1):
         check.add(fix, LEVEL)
     assert check.metres(None) == 0.0
@@ -164,7 +164,7 @@ def test_a_tilt_at_an_unknown_height_is_widened() -> None:
 
 def test_without_an_attitude_nothing_is_said() -> None:
     """No attitude of the camera: no evidence."""
-    check = TiltCheck(IntegrityMonitorConfig())
+    check = TiltCheck()
     for fix in fixes(1, 20.0, 0.3, 2):
         check.add(fix, None)
         check.add(replace(fix, quaternion=None), LEVEL)

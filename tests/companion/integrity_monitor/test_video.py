@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.config import VideoCheckConfig
 from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
 from localizer.types import Image
 
@@ -51,7 +50,7 @@ class Camera:
 
 def watch(pictures: list[Image]) -> list[FrameVerdict]:
     """What is said of pictures at 10 Hz."""
-    watcher = FrozenVideoDetector(VideoCheckConfig())
+    watcher = FrozenVideoDetector()
     return [watcher.add(k * 1_000_000_000 // HZ, picture) for k, picture in enumerate(pictures)]
 
 

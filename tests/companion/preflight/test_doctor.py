@@ -12,7 +12,8 @@ from companion.config import CameraModel, parse_config
 from companion.preflight.doctor import examine_deployment
 from companion.sources import StreamState
 from localizer.types import Frame
-from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
+from mavlink_bridge.preflight.doctor import Diagnosis
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 SIZE = (160, 120)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}

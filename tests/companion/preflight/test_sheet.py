@@ -20,7 +20,8 @@ from companion.preflight.map_pin import map_hash
 from companion.preflight.sheet import PreflightSheet, as_html, as_text, make_sheet, write_sheet
 from localizer.config import LocalizerConfig
 from localizer.map.cache.cache import MANIFEST_NAME
-from mavlink_bridge.preflight.doctor import Diagnosis, DoctorFinding
+from mavlink_bridge.preflight.doctor import Diagnosis
+from mavlink_bridge.preflight.rules import DoctorFinding
 
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=timezone.utc)
 GOOD = DoctorFinding("EK3_SRC2_POSXY", "6", "6", "", True, True)

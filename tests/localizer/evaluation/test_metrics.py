@@ -41,7 +41,7 @@ def test_no_estimate_at_all_is_not_a_perfect_score():
     assert m.completeness == 0.0
     assert m.median_translation_m is None
     assert m.max_rotation_deg is None
-    assert m.to_dict()["p95_translation_m"] is None
+    assert m.p95_translation_m is None
 
 
 def test_no_frames():

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from localizer.errors import ModelError
-from localizer.features import GradientExtractor, OnnxExtractor, extractor, load_extractor
+from localizer.features import extractor
 from localizer.features.detail import DetailExtractor, detail_level
-from localizer.features.extractor import model_key
+from localizer.features.extractor import OnnxExtractor, load_extractor, model_key
+from localizer.features.gradient import GradientExtractor
 from localizer.types import FeaturePyramid
 
 

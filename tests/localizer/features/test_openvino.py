@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localizer.features import OnnxExtractor, providers
-from localizer.features.extractor import SHIPPED_MODEL, load_extractor
+from localizer.features import providers
+from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor, load_extractor
 from localizer.features.openvino_session import OpenVinoSession, is_worthwhile
 from localizer.features.subgraph import cut_to_outputs
 

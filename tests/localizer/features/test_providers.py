@@ -12,8 +12,8 @@ import onnxruntime as ort
 import pytest
 
 from localizer.errors import ModelError
-from localizer.features import OnnxExtractor, providers
-from localizer.features.extractor import SHIPPED_MODEL
+from localizer.features import providers
+from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor
 
 NAMES = {"TensorRT": "Tensorrt", "CUDA": "CUDA", "CPU": "CPU", "Azure": "Azure"}
 START = ort.InferenceSession

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from localizer.config import LocalizerConfig
-from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
 from localizer.forecast.forecast import Forecaster, draw_prior
 from localizer.forecast.risk import RISK_LIMIT, Figures, failure_risk
 from localizer.forecast.visit import FORECAST_CONDITIONS, simulate_visit

@@ -152,9 +152,9 @@ def test_the_usable_part_is_a_rectangle_there_too() -> None:
     faulty = np.zeros((400, 400), bool)
     faulty[:40] = True
     found = usable_part(mosaic, faulty, 80.0, frame)
-    assert found.west > 179.99
-    assert found.east < -179.99
-    assert found.south < found.north
+    assert found.box.west > 179.99
+    assert found.box.east < -179.99
+    assert found.box.south < found.box.north
 
 
 # --- The geoid against values that its makers and others published ------------------------------

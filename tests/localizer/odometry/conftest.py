@@ -9,7 +9,7 @@ import pytest
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
-from localizer.odometry import OdometryFrame
+from localizer.odometry.estimate import OdometryFrame
 from tests.localizer.registration.conftest import SyntheticPlace, camera_pose
 
 CAMERA = Camera(160, 120, 150.0, 144.0, 76.0, 63.5)

@@ -6,7 +6,7 @@ import pytest
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.config import GrowthModel
 from localizer.odometry.growth import add_scale_error, fuse, transferred, without_constant_error
-from localizer.registration import attitude_constraint, combine, height_constraint
+from localizer.registration.priors import attitude_constraint, combine, height_constraint
 
 MODEL = GrowthModel(scale=0.01, horizontal=0.1, vertical=0.2, tilt=1e-3, heading=2e-3)
 SIGMA = np.diag([0.3, 0.2, 0.5, 0.01, 0.02, 0.03]) ** 2

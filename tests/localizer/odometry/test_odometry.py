@@ -10,25 +10,28 @@ import pytest
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError, OdometryError
 from localizer.geometry.pose import Array, Pose, hat, so3_exp, so3_log
-from localizer.odometry import (
-    DepthSource,
+from localizer.odometry.config import OdometryConfig
+from localizer.odometry.estimate import OdometryStatus
+from localizer.odometry.ground import (
     FlatGround,
     GroundUncertainty,
-    ImageFault,
-    OdometryConfig,
-    OdometryStatus,
+    RangefinderGround,
     TerrainModel,
-    Usability,
-    VisualOdometry,
-    examine,
-    odometry_optimizer,
+    ground_points,
+    height_above_ground,
 )
-from localizer.odometry.ground import RangefinderGround, ground_points, height_above_ground
-from localizer.odometry.keyframe import keyframe_anchors
+from localizer.odometry.keyframe import DepthSource, keyframe_anchors
+from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
 from localizer.odometry.parallax import ParallaxAlignment, ParallaxView, align
-from localizer.registration import JNGO, attitude_constraint, combine, height_constraint
+from localizer.odometry.usability import ImageFault, Usability, examine
 from localizer.registration.cpu.kernel import NumbaBackend
-from localizer.registration.priors import PoseConstraint
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import (
+    PoseConstraint,
+    attitude_constraint,
+    combine,
+    height_constraint,
+)
 from localizer.registration.sampling import sample_features
 from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
 from tests.localizer.registration.conftest import SyntheticPlace, camera_pose

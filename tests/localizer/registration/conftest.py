@@ -10,7 +10,7 @@ import pytest
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
-from localizer.registration import select_anchors
+from localizer.registration.anchors import select_anchors
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior, RenderedView
 
 STRIDES = (8, 4, 2)

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localizer.registration import select_anchors
-from localizer.registration.anchors import morton_code
+from localizer.registration.anchors import morton_code, select_anchors
 from localizer.registration.backend import sample_bilinear
 from localizer.registration.cpu.reference import feature_gradients
 from localizer.registration.sampling import sample_features, structure_tensors

@@ -9,12 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from localizer.registration import JNGO, JNGOConfig, devices
+from localizer.registration import devices
+from localizer.registration.config import JNGOConfig
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cuda import backend as cuda_backend
 from localizer.registration.cuda import compiler, driver, schedule
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
 from localizer.registration.devices import open_backend
+from localizer.registration.jngo import JNGO
 
 
 def lines(caplog):

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
-from localizer.registration import JNGO
 from localizer.registration.agreement import agreement
 from localizer.registration.backend import camera_from_local, level_problems, local_origin
 from localizer.registration.hypotheses import draw_hypotheses, generate_hypotheses
+from localizer.registration.jngo import JNGO
 from localizer.types import FeatureLevel, PosePrior, RegistrationStatus
 
 

@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from localizer.geometry.pose import Pose, so3_exp, so3_log
-from localizer.registration import (
-    JNGO,
-    JNGOConfig,
-    attitude_constraint,
-    height_constraint,
-    select_anchors,
-)
+from localizer.registration.anchors import select_anchors
+from localizer.registration.config import JNGOConfig
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import attitude_constraint, height_constraint
 from localizer.types import FeatureLevel, RegistrationStatus
 
 

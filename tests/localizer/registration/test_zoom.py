@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
-from localizer.registration import JNGO, select_anchors
+from localizer.registration.anchors import select_anchors
+from localizer.registration.jngo import JNGO
 from localizer.registration.zoom import focal_gain
 from localizer.tracking.pipeline import mask_unseen_features
 from localizer.types import RegistrationStatus

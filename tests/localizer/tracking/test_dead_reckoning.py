@@ -18,7 +18,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.acceptance import IntegrityConfig
 from localizer.map.cache.cache import TileCache
-from localizer.odometry import OdometryConfig
+from localizer.odometry.config import OdometryConfig
 from localizer.odometry.keyframe import DepthSource
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint

@@ -15,7 +15,7 @@ onnx = pytest.importorskip("onnx")
 import torch  # noqa: E402
 
 from localizer.errors import ModelError  # noqa: E402
-from localizer.features import OnnxExtractor  # noqa: E402
+from localizer.features.extractor import OnnxExtractor  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.data.batches import LoaderConfig, collate, crop_pair  # noqa: E402
 from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the extra `train`")
 onnx = pytest.importorskip("onnx")
 
 from localizer.errors import ModelError  # noqa: E402
-from localizer.features import OnnxExtractor  # noqa: E402
+from localizer.features.extractor import OnnxExtractor  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402

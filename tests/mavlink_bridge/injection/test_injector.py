@@ -12,7 +12,7 @@ import pytest
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.config import InjectionConfig, YawGuardConfig
+from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.injection.encode import DIAGONAL, EncodedMessage, InjectionContext
 from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.link.clock import SteadyUtc
@@ -314,9 +314,10 @@ def test_gyros_are_trusted_over_a_dropout() -> None:
     assert [t for t, _ in sent if t > 15.5 * SECOND]
 
 
-def test_after_a_long_dropout_the_gyros_are_not_trusted() -> None:
+def test_after_a_long_dropout_the_gyros_are_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
     """They drift: what they say of a minute ago is no evidence against the autopilot's yaw."""
-    it = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(memory_s=2.0))
+    monkeypatch.setattr("mavlink_bridge.injection.yaw_guard._MEMORY_S", 2.0)
+    it = injector(rate_hz=10, delay_ms=0)
     where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
 
     def dropout(f: VisionFix) -> VisionFix | None:
@@ -330,11 +331,11 @@ def test_after_a_long_dropout_the_gyros_are_not_trusted() -> None:
 
 def test_what_was_refused_is_released_by_a_tighter_limit_than_it_was_held_to() -> None:
     """A frame at the limit itself would be sent and withheld by turns."""
-    it = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(limit_deg=3.5))
+    it = injector(rate_hz=10, delay_ms=0)
     change = turned_by(lambda t: 5.0 if t < 3.0 else 3.0 if t < 6.0 else 2.0)
     sent = fly(it, seconds=8, fix_hz=10, latency_ms=0, change=change)
     assert 6 * SECOND < min(t for t, _ in sent) < 7 * SECOND
-    never_turned = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(limit_deg=3.5))
+    never_turned = injector(rate_hz=10, delay_ms=0)
     change = turned_by(lambda _: 3.0)
     sent = fly(never_turned, seconds=3, fix_hz=10, latency_ms=0, change=change)
     assert never_turned.counters["fixes_yaw_refused"] == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -119,17 +118,27 @@ def test_only_who_never_began_is_kept_from_beginning_by_a_restart(begins, kept):
     restart it is flown on.
     """
     told: list[bool] = []
-    file: Any = SimpleNamespace(
-        store=lambda what: told.append(what["against"]), drop=lambda: told.append(False),
-        recall=lambda: None,
-    )  # fmt: skip
+
+    class Memory(ShadowFailureMemory):
+        def __init__(self) -> None:
+            """Has no file."""
+
+        def recall_state(self) -> None:
+            return None
+
+        def store_state(self, state: dict[str, Any]) -> None:
+            told.append(state["against"])
+
+        def drop(self) -> None:
+            told.append(False)
+
     scores = [ShadowScore(begins, 100, () if begins else (RATE,))]
     interlock = ShadowInterlock(
         False,
         lambda _: scores[-1],
         lambda: SECOND,
         StatusNotifier(lambda _: None),
-        ShadowFailureMemory(file),
+        Memory(),
     )
     interlock.recall()
     for second, against in ((1, ()), (2, (OFF,)), (4, (OFF,))):

@@ -23,7 +23,6 @@ from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.restart_memory import (
     InjectionEnableMemory,
-    RestartMemory,
     ShadowFailureMemory,
 )
 from mavlink_bridge.link.link import sleep_until
@@ -32,13 +31,12 @@ _CHILD = """
 import sys, time
 from pathlib import Path
 from mavlink_bridge.config import InjectionEnableConfig
-from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
+from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 files = [Path(name) for name in sys.argv[1:]]
 gates = [
     InjectionEnable(
-        InjectionEnableConfig(), lambda _: None, InjectionEnableMemory(RestartMemory(file))
-    )
+        InjectionEnableConfig(), lambda _: None, InjectionEnableMemory(file))
     for file in files
 ]
 gates[0].command(31010, 1.0)
@@ -69,10 +67,10 @@ def left_open(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionEnable, list[Alert]]:
     told: list[Alert] = []
     kept = json.loads(path.read_text()) if path.exists() else {}
-    memory = RestartMemory(
+    memory = InjectionEnableMemory(
         path, lambda: kept.get("utc_s", 0.0) + later_s, lambda: kept.get("clock_s", 0.0) + later_s
     )
-    enable = InjectionEnable(InjectionEnableConfig(), told.append, InjectionEnableMemory(memory))
+    enable = InjectionEnable(InjectionEnableConfig(), told.append, memory)
     enable.recall()
     enable.announce()
     return enable, told
@@ -98,9 +96,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
     back with its gate closed and the vehicle without a position.
     """
     path, wall, clock = tmp_path / "gate.json", [1e9], [500.0]
-    memory = InjectionEnableMemory(
-        RestartMemory(path, lambda: wall[0], lambda: clock[0], "this run")
-    )
+    memory = InjectionEnableMemory(path, lambda: wall[0], lambda: clock[0], "this run")
     memory.store_enabled(by_channel=True)
     while not path.exists():
         pass
@@ -110,9 +106,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
     def recalled(boot: str, later_s: float) -> tuple[bool, float] | None:
         path.write_text(left)
         path.chmod(0o600)
-        again = InjectionEnableMemory(
-            RestartMemory(path, lambda: wall[0], lambda: clock[0] + later_s, boot)
-        )
+        again = InjectionEnableMemory(path, lambda: wall[0], lambda: clock[0] + later_s, boot)
         try:
             return again.recall()
         finally:
@@ -145,7 +139,7 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
     path = tmp_path / "gate.json"
     path.write_text(text)
     path.chmod(0o600)
-    memory = InjectionEnableMemory(RestartMemory(path))
+    memory = InjectionEnableMemory(path)
     assert memory.recall() is None
     path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
     path.chmod(0o666)
@@ -157,7 +151,7 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
 def test_a_no_go_is_of_the_map_that_was_seen(tmp_path: Path, flown: str, kept: bool) -> None:
     """The map was exchanged for the right one, and ten minutes long nothing was injected."""
     path = tmp_path / "no-go.json"
-    killed = ShadowFailureMemory(RestartMemory(path, about="map a"))
+    killed = ShadowFailureMemory(path, about="map a")
     killed.store(True)
     while not path.exists():
         pass
@@ -165,7 +159,7 @@ def test_a_no_go_is_of_the_map_that_was_seen(tmp_path: Path, flown: str, kept: b
     killed.stop()
     path.write_text(left)
     path.chmod(0o600)
-    again = ShadowFailureMemory(RestartMemory(path, about=flown))
+    again = ShadowFailureMemory(path, about=flown)
     assert again.recall() == kept
     again.stop()
 
@@ -174,7 +168,7 @@ def test_a_no_go_of_an_older_version_is_of_any_map(tmp_path: Path) -> None:
     path = tmp_path / "no-go.json"
     path.write_text(json.dumps({"against": "20 m off", "utc_s": time.time()}))
     path.chmod(0o600)
-    memory = ShadowFailureMemory(RestartMemory(path, about="map a"))
+    memory = ShadowFailureMemory(path, about="map a")
     assert memory.recall()
     memory.stop()
 
@@ -185,7 +179,7 @@ def test_a_no_go_of_nonsense_is_none(tmp_path: Path, against: object) -> None:
     stamps = {"utc_s": time.time(), "boot": "", "clock_s": 0.0}
     path.write_text(json.dumps({"against": against} | stamps))
     path.chmod(0o600)
-    memory = ShadowFailureMemory(RestartMemory(path))
+    memory = ShadowFailureMemory(path)
     assert not memory.recall()
     memory.stop()
 
@@ -202,7 +196,7 @@ def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(tmp_path, m
                 memory.stop()
 
     monkeypatch.setattr(os, "fsync", ordered_to_end)
-    memory = InjectionEnableMemory(RestartMemory(path))
+    memory = InjectionEnableMemory(path)
     memory.store_enabled(by_channel=False)
     assert ends.wait(20.0)
     memory.stop()

@@ -15,14 +15,14 @@ from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.preflight.doctor import (
-    DoctorFinding,
-    check_failsafes,
     check_parameters,
     examine,
     repair,
 )
+from mavlink_bridge.preflight.failsafes import failsafes, px4_failsafes
 from mavlink_bridge.preflight.parameters import ParameterClient, decode_value, encode_value
 from mavlink_bridge.preflight.rules import (
+    DoctorFinding,
     ardupilot_rules,
     arming_rules,
     find_source_set,
@@ -350,7 +350,7 @@ def test_two_vehicles_on_the_link_are_a_required_failure(autopilot, monkeypatch)
     ],
 )
 def test_what_happens_when_vision_ends_is_told_and_never_written(name, value, told):
-    findings = check_failsafes(config(), {**GOOD, name: value}.get)
+    findings = failsafes(config(), {**GOOD, name: value}.get)
     assert {f.name for f in findings if not f.ok} == told
     assert not any(f.required or f.fix is not None for f in findings)
     ends = next(f for f in findings if f.name == "when vision ends")
@@ -384,7 +384,7 @@ PX4_GOOD = {
     ],
 )
 def test_what_px4_does_when_vision_ends_is_told_likewise(name, value, told):
-    findings = check_failsafes(config(), {**PX4_GOOD, name: value}.get, px4=True)
+    findings = px4_failsafes(config(), {**PX4_GOOD, name: value}.get)
     assert {f.name for f in findings} == {*PX4_GOOD, "when vision ends"} - {"COM_POSCTL_NAVL"}
     assert {f.name for f in findings if not f.ok} == told
     assert not any(f.required or f.fix is not None for f in findings)
@@ -394,7 +394,7 @@ def test_what_px4_does_when_vision_ends_is_told_likewise(name, value, told):
 
 def test_gnss_beside_the_auxiliary_position_is_not_told() -> None:
     sensor = config(message="global_position_sensor")
-    findings = check_failsafes(sensor, {**PX4_GOOD, "EKF2_GPS_CTRL": 7.0}.get, px4=True)
+    findings = px4_failsafes(sensor, {**PX4_GOOD, "EKF2_GPS_CTRL": 7.0}.get)
     assert "EKF2_GPS_CTRL" not in {f.name for f in findings}
 
 
@@ -417,8 +417,8 @@ def test_px4_is_asked_for_its_own_failsafes_and_has_no_source_sets(autopilot, mo
 
 
 def test_a_vehicle_without_these_parameters_gets_no_such_line(autopilot: Any) -> None:
-    assert check_failsafes(config(), {}.get) == []
-    assert check_failsafes(config().model_copy(update={"mode": "off"}), GOOD.get) == []
+    assert failsafes(config(), {}.get) == []
+    assert failsafes(config().model_copy(update={"mode": "off"}), GOOD.get) == []
     autopilot.parameters = {"FS_EKF_ACTION": 1.0}
     with ParameterClient(config(autopilot.port)) as client:
         assert client.read_known(("FS_EKF_ACTION", "NO_SUCH")) == {"FS_EKF_ACTION": 1.0}

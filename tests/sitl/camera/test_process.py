@@ -27,6 +27,7 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.types import Frame
+from sitl.camera.faults import PictureFault
 from sitl.camera.process import WorldCameraConfig, WorldCameraProcess
 from sitl.camera.true_motion import TruthSample
 from sitl.errors import WorldCameraError
@@ -132,12 +133,12 @@ def test_streams_what_the_true_pose_sees_and_stops_and_resumes(cache: Path, tmp_
     watcher.start()
     with WorldCameraProcess(_config(cache, log, url)) as process, _Flight(process):
         wait_for(12)
-        process.pause()
+        process.send(PictureFault("silent"))
         deadline = time.monotonic() + 120
         while states[-1] is not StreamState.STALLED:
             assert time.monotonic() < deadline, states
             time.sleep(0.05)
-        process.resume()
+        process.send(None)
         wait_for(source.counters.delivered + 8)
     source.close()
     watcher.join(120)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -188,7 +189,7 @@ def test_a_recorded_sequence_is_read_back_as_it_was(renderer, tmp_path):
 
 def test_the_frame_log_is_read_by_the_analysis(tmp_path: Path) -> None:
     pose = _pose()
-    with FrameLog(tmp_path / "frames.csv") as log:
+    with closing(FrameLog(tmp_path / "frames.csv")) as log:
         log.add(0, 123_456_789_012_345_678, pose)
         log.add(1, 123_456_789_112_345_678, pose)
     columns = read_columns(tmp_path / "frames.csv")

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
 
 def _judged(localizer=None, ekf=0.5, fixed=1.0, inside=96.0, level=100.0, targets=99.0):
-    metrics = LocalizationMetrics(**(GOOD.to_dict() | (localizer or {})))
+    metrics = replace(GOOD, **(localizer or {}))
     return FlightFigures(
         metrics, Spread(0.1, ekf, 9.0), Spread(0.1, fixed, 9.0), inside, level, targets
     )

@@ -283,13 +283,15 @@ def test_the_commands_exit_code_is_for_scripts(tmp_path, monkeypatch, error, cod
 def test_bad_arguments_of_the_command_are_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for arguments, named in (
-        (["--fc", "px4"], "px4"),
         (["--only", "nonsense"], "nonsense"),
         (["--out", str(tmp_path / "file"), "--only", "vpe"], "is a file"),
         (["--scenarios", str(tmp_path)], "holds no scenario files"),
     ):
         with pytest.raises(ScenarioError, match=named):
             CliRunner().invoke(cli.app, ["suite", *arguments], catch_exceptions=False)
+    refused = CliRunner().invoke(cli.app, ["suite", "--fc", "px4"])
+    assert refused.exit_code == 2
+    assert "'px4' is not one of" in refused.output
 
 
 def test_a_vehicle_that_fell_behind_is_marked() -> None:

@@ -11,11 +11,12 @@ from pyproj import CRS
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
-from localizer.map.fetch.area import Area, area_around, utm_zone
+from localizer.map.fetch.area import Area, area_around
 from localizer.map.fetch.catalogue import CatalogueSource, choose, load_sources
 from localizer.map.fetch.cloud import degree_files
 from localizer.map.fetch.raster import FetchGrid
 from localizer.map.fetch.web_map import wms_url
+from localizer.map.importers.height_crs import utm_zone
 
 BERN = area_around(np.array([[46.948, 7.447]]), 300.0)
 SAHARA = area_around(np.array([[23.0, 5.0]]), 300.0)
@@ -103,7 +104,7 @@ def test_areas():
     width, height = BERN.size_m
     assert width == pytest.approx(600, rel=0.01)
     assert height == pytest.approx(600, rel=0.01)
-    assert utm_zone(BERN).to_epsg() == 32632
+    assert utm_zone(*BERN.centre).to_epsg() == 32632
     for corners in ((8, 46, 7, 47), (7, 46, 7, 47), (0, 0, 90, 10), (float("nan"), 0, 1, 1)):
         with pytest.raises(MapFetchError):
             Area(*corners)

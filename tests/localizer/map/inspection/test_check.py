@@ -144,8 +144,8 @@ def test_of_a_map_with_bad_edges_the_usable_middle_is_named(cache):
     assert found.size_m == pytest.approx((200.0, 300.0), abs=16.0)
     for north, east, inside in ((0.0, 100.0, True), (0.0, -20.0, False), (150.0, 100.0, False)):
         at = cache.frame.position(np.array([east, north, 0.0]))
-        lies = found.south < at.latitude_deg < found.north
-        assert (lies and found.west < at.longitude_deg < found.east) is inside
+        lies = found.box.south < at.latitude_deg < found.box.north
+        assert (lies and found.box.west < at.longitude_deg < found.box.east) is inside
     assert usable_part(mosaic, np.ones_like(faulty), 120.0, cache.frame) is None
 
 

@@ -10,14 +10,10 @@ import pytest
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
 from localizer.geometry.pose import so3_exp
-from localizer.registration import (
-    JNGO,
-    JNGOConfig,
-    attitude_constraint,
-    combine,
-    height_constraint,
-    select_anchors,
-)
+from localizer.registration.anchors import select_anchors
+from localizer.registration.config import JNGOConfig
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import attitude_constraint, combine, height_constraint
 from localizer.types import FeatureLevel, FeaturePyramid, PosePrior, RegistrationStatus
 
 CONFIG = JNGOConfig(hypotheses=16, survivors=(6, 3), swarm_anchors=(100, 150, 150))
