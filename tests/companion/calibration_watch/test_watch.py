@@ -245,7 +245,7 @@ def test_pictures_that_come_again_are_forgotten() -> None:
 
 @pytest.mark.parametrize("since_s", [18.0, 20.2])
 def test_excluded_frames_do_not_bring_a_discarded_time_offset_back(since_s: float) -> None:
-    """A video that repeats itself is excluded from before, or just after, the step it makes."""
+    """The excluded frames begin before, or just after, the time from which it is discarded."""
     sigmas = []
 
     class Doubted(Flown):
