@@ -171,8 +171,9 @@ class CalibrationWatch:
         self._depth_m = seen.depth_m
         if self._doubted_ns is not None and seen.time_ns >= self._doubted_ns:
             self._doubted_ns = None
-            self._position.forget_time_offset()
-            self._attitude.forget_time_offset()
+            for kept in (_Known(0, self._position, self._attitude), *self._kept):
+                kept.position.forget_time_offset()
+                kept.attitude.forget_time_offset()
         if not self._kept or seen.time_ns - self._kept[-1].time_ns >= _KEEPS_NS:
             known_now = _Known(seen.time_ns - 1, self._position, self._attitude)
             self._kept.append(copy.deepcopy(known_now))

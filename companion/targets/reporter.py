@@ -34,8 +34,9 @@ class TargetReporter:
 
     cast: intersects rays with the map. on_target: receives each fix. on_gone: receives the name of
     each target that ended, after its last on_target. Both are called on the targets' thread.
-    report_alert: sends an alert to the operator. failed: number of calls that raised an error, of
-    which the first is logged; unmatched: number of detections whose frame has no accepted estimate.
+    report_alert: sends an alert to the operator. failed: number of calls that raised an error; the
+    first and each click's are logged. unmatched: number of detections whose frame has no accepted
+    estimate.
     """
 
     def __init__(
@@ -155,7 +156,7 @@ class TargetReporter:
             work(*arguments)
         except Exception:  # a target must not end the flight
             self.failed += 1
-            if self.failed == 1:
+            if self.failed == 1 or work == self._population.begin:  # an alert refers to the log
                 _log.exception("a target could not be located")
             return False
         return True

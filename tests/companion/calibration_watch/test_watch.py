@@ -241,3 +241,23 @@ def test_pictures_that_come_again_are_forgotten() -> None:
     assert not set().union(*(findings(f) for at_s, f in flown.found if not 40.0 < at_s < 44.0))
     assert last.late_s.value == pytest.approx(before.late_s.value, abs=0.02)
     assert last.focal.value == pytest.approx(before.focal.value, abs=0.002)
+
+
+@pytest.mark.parametrize("since_s", [18.0, 20.2])
+def test_excluded_frames_do_not_bring_a_discarded_time_offset_back(since_s: float) -> None:
+    """The excluded frames begin before, or just after, the time from which it is discarded."""
+    sigmas = []
+
+    class Doubted(Flown):
+        def _sighting(self, at_s: float) -> CalibrationObservation:
+            if at_s == 20.0:
+                self.watch.suspect_timestamps(20_000_000_000)
+            if at_s == 23.0:
+                self.watch.exclude_since(round(since_s * 1e9))
+                sigmas.append(self.watch.figures().late_s.sigma)
+            return super()._sighting(at_s)
+
+    flown = Doubted(Wrong(), square(60.0, climb_s=0.0), lost).fly()
+    before = next(figures for at_s, figures in flown.found if at_s >= 19.0)
+    assert before.late_s.sigma < 0.1
+    assert sigmas == pytest.approx([0.15], rel=0.05)  # as at a start

@@ -150,7 +150,9 @@ def test_a_flood_of_names_is_bounded_and_room_comes_back(caplog):
     assert sum("more than 32 targets" in r.message for r in caplog.records) == 1
 
 
-def test_a_click_that_no_map_answers_is_refused_and_not_left_alive():
+def test_a_click_that_no_map_answers_is_refused_and_not_left_alive(caplog):
+    """Its alert refers to the log, which had the first click's error only."""
+
     def unreadable(_origin, _directions):
         raise MapCacheError("tile 7: cannot be read")
 
@@ -162,13 +164,16 @@ def test_a_click_that_no_map_answers_is_refused_and_not_left_alive():
     )  # fmt: skip
     reporter.start()
     try:
-        reporter.begin(Click(3, _estimate(50 * MS), (320.0, 240.0)))
-        assert ended.wait(60.0)
+        for number in (3, 4):
+            ended.clear()
+            reporter.begin(Click(number, _estimate(50 * MS), (320.0, 240.0)))
+            assert ended.wait(60.0)
     finally:
         reporter.stop()
-    assert gone == ["ground station 3"]
-    assert said == [alert(AlertId.TARGET_UNREADABLE, number=3)]
-    assert reporter.failed == 1
+    assert gone == ["ground station 3", "ground station 4"]
+    assert said == [alert(AlertId.TARGET_UNREADABLE, number=number) for number in (3, 4)]
+    assert reporter.failed == 2
+    assert sum("could not be located" in r.message for r in caplog.records) == 2
 
 
 # --- Where the camera was at a time that no frame has, and at one that a frame has nearly -------
