@@ -137,8 +137,8 @@ INJECTION: tuple[AlertSpec, ...] = (
           "the EKF has not jumped to the fixes; the next one increments it again, five times at "
           "most", NOTHING),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "no *EKF check* fails, and `ekf_jump` is not active: 3 s after the first fix is sent, when "
-          "such an alert has ended, or 3.5 s after `reset_counter` incremented, if the EKF is "
+          "no *EKF check* fails, and `ekf_jump` is not active: 3 s after the first fix is sent, "
+          "when such an alert has ended, or 3.5 s after `reset_counter` incremented, if the EKF is "
           "within 1 m + 3 sigma",
           "the EKF is where the fixes are", NOTHING),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
@@ -193,5 +193,5 @@ INJECTION: tuple[AlertSpec, ...] = (
               "fixes are sent without a time", "set the clock and restart"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog incomplete: {why}", {"why": "name"},
           "the .tlog (`bridge.tlog`) cannot be written, or has 2 GiB; once",
-          "MAVLink messages are not recorded any more; the flight goes on", "check the disk"),
+          "MAVLink messages from then on are missing in it; the flight goes on", "check the disk"),
 )  # fmt: skip

@@ -169,7 +169,7 @@ SOURCES: tuple[AlertSpec, ...] = (
               "the EKF uses vision, and GNSS has a 3D fix, but for 2 s it differs from vision "
               "(*off vision*) or from the IMU's motion (*off IMU*), scatters (*noise*), or states "
               "over 5 m accuracy (*claimed*); N: by how much",
-              "without a text: no 3D fix, or the EKF uses GNSS; GNSS agrees for 5 s",
+              "GNSS agrees for 5 s; without a text: no 3D fix, or the EKF uses GNSS",
               "GNSS is jammed, spoofed or not settled, or the map has an offset; the program does "
               "not select GNSS, and the EKF stays on vision",
               "select GNSS only if landmarks confirm it",
