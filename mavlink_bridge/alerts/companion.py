@@ -29,7 +29,7 @@ HEALTH: tuple[AlertSpec, ...] = (
               "rejected (`lost`)",
               _NO_FIX, _TAKE_OVER),
     condition(A.TRACKING, INFO, "localization tracking", {}, "frames are accepted",
-              "`degraded`, `bridging` or `lost`",
+              "another localization status, such as `bridging`",
               "fixes are made; with injection they are sent, unless an alert says otherwise",
               NOTHING),
     condition(A.DEGRADED, WARNING, "localization degraded", {},
@@ -45,15 +45,15 @@ HEALTH: tuple[AlertSpec, ...] = (
               "accepted frame; N m: 95 % bound of the error",
               "fly back over mapped ground with buildings and roads"),
     condition(A.LOST, ERROR, "localization lost {seconds:.0f} s", {"seconds": "s"},
-              "ten frames in a row are rejected, or odometry fails during `bridging` or while the "
+              "odometry fails during `bridging`, or while ten frames in a row are rejected or the "
               "predicted position is too uncertain",
               "a search of the map finds a position, and frames and motion confirm it",
               f"{_NO_FIX}; N: time since the map last confirmed the position (0: never)",
               _TAKE_OVER),
     condition(A.EKF_UNCERTAIN, WARNING, "autopilot position +-{metres:.0f} m", {"metres": "m"},
               "`lost` is active, and the autopilot has a position", WHILE,
-              "N: 95 % bound of its error, by the time since its last GNSS or vision fix, when the "
-              "text is sent; it grows",
+              "N: 95 % bound of its error when the text is sent; it grows with the time since its "
+              "last GNSS or vision fix",
               f"{_TAKE_OVER}; keep N to obstacles"),
     condition(A.NO_FRAME, WARNING, "no frame is being localized", {},
               "frames are received, but for 2 s none was processed, without an error (not during "
@@ -68,10 +68,9 @@ HEALTH: tuple[AlertSpec, ...] = (
               {"done": "Hz", "offered": "Hz"},
               "over 5 s fewer than 3 frames/s (the first N) are processed, and 6 or more (the "
               "second) received", WHILE,
-              f"there are too few fixes for the EKF; directly after `no_frame` it is no overload: "
-              f"{_HANG}, and there are {_NO_FIX}",
-              f"{_TAKE_OVER}; check the computer's load and temperature, after `no_frame` the log"
-              ),
+              f"there are too few fixes for the EKF; none if {_HANG} (`no_frame` came before, or "
+              "`rate_hz` in health.json is 0)",
+              f"{_TAKE_OVER}; check the computer's load and temperature; after a hang the log"),
     condition(A.SEARCH_NOT_READY, WARNING, "search not ready", {},
               "the position is not known (at the start or `lost`), and the map search is being "
               "prepared", WHILE,
@@ -135,7 +134,7 @@ HEALTH: tuple[AlertSpec, ...] = (
           f"it restarts after N (2 to 30 s); {_NO_FIX} for about 10 s more", _TAKE_OVER),
     event(A.DEPLOYMENT_LOST, WARNING, "deployment file lost, flown as before", {},
           "at a restart after a crash the deployment file cannot be read or used",
-          "the settings of the first start are used; fixes are not affected",
+          "the settings of the first start are used",
           "after landing read events.csv; check file and disk"),
     event(A.VIDEO_SENDER_IGNORED, WARNING, "video of {host} ignored", {"host": "name"},
           "UDP: video arrives from another address than `camera.settings.sender` or, if not set, "
@@ -205,7 +204,7 @@ TARGETS: tuple[AlertSpec, ...] = (
               {"name": "name", "why": "name"},
               "for 2 s the position of a target of the detector, reported before, is rejected "
               "(WHY); one text in 10 s at most; its end is not sent", WHILE,
-              "the target is not sent to the ground station", NOTHING),
+              "the target is neither sent nor shown", NOTHING),
 )  # fmt: skip
 CONSOLE: tuple[AlertSpec, ...] = (
     event(A.CONSOLE_STOP, NOTICE, "targets ended", {},

@@ -137,14 +137,14 @@ INJECTION: tuple[AlertSpec, ...] = (
           "the EKF has not jumped to the fixes; the next one increments it again, five times at "
           "most", NOTHING),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "no *EKF check* fails, and `ekf_jump` is not active: 3 s after the first fix is sent, "
-          "when such an alert has ended, or 3.5 s after `reset_counter` incremented, if the EKF is "
+          "no *EKF check* fails, and `ekf_jump` is not active: 3 s after the first sent fix, after "
+          "the end of such an alert, or 3.5 s after `reset_counter` incremented, once the EKF is "
           "within 1 m + 3 sigma",
           "the EKF is where the fixes are", NOTHING),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
               "positions are sent at less than 4 Hz (message gps_input: 4.65 Hz; EKF check)", WHILE,
-              "the EKF may stop using them",
+              "they are sent, but the EKF may stop using them",
               f"{_LANDMARKS}; on the ground check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
               "ArduPilot's EKF flag EKF_UNINITIALIZED is set (EKF check)", WHILE, _NOT_USED,
@@ -167,13 +167,13 @@ INJECTION: tuple[AlertSpec, ...] = (
               {"age_ms": "ms", "limit_ms": "ms"},
               "each of the last 50 fixes (not ArduPilot: their median) is over "
               "`bridge.injection.delay_ms` + 10 ms old when made",
-              "for 15 s the age is below 90 % of it (`fixes_in_time`)",
+              "for 15 s the age is below 90 % of it; `fixes_in_time` follows",
               "fixes are sent, but the EKF takes them for newer",
               f"{_LANDMARKS}; on the ground raise delay_ms and the autopilot's delay"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
               "the median age of 50 fixes is above what the firmware can use (250 ms, PX4 300 ms)",
-              "for 15 s it is below 90 % of it (`fixes_in_time`)",
+              "for 15 s it is below 90 % of it; `fixes_in_time` follows",
               "in their place positions extrapolated by up to 0.5 s are sent",
               f"{_LANDMARKS}; on the ground use a faster computer or a smaller `localizer.width`"),
     event(A.FIXES_IN_TIME, INFO, "fixes are in time again", {},
@@ -193,5 +193,5 @@ INJECTION: tuple[AlertSpec, ...] = (
               "fixes are sent without a time", "set the clock and restart"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog incomplete: {why}", {"why": "name"},
           "the .tlog (`bridge.tlog`) cannot be written, or has 2 GiB; once",
-          "MAVLink messages from then on are missing in it; the flight goes on", "check the disk"),
+          "MAVLink messages from then on are missing in it", "check the disk"),
 )  # fmt: skip

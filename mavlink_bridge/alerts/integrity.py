@@ -8,7 +8,7 @@ from mavlink_bridge.alerts.words import CalibrationError, GnssDisagreement
 
 WARNING, ERROR = Severity.WARNING, Severity.ERROR
 _WITHIN = "N + 2 sigma is below the limit for 10 s"
-_NOT_STARTED = "injection does not start; if it runs, it continues"
+_NOT_STARTED = "injection does not start; running injection continues"
 _CALIBRATE = "after landing run `companion calibrate flight` on the record"
 _TAKE_OVER = "take over"
 _IF_LASTS = "if it lasts, take over"
@@ -18,9 +18,9 @@ _STILL_VELOCITY = "during `bridging` ArduPilot still receives the velocity"
 INTEGRITY: tuple[AlertSpec, ...] = (
     AlertSpec(A.VIDEO_FROZEN, ERROR, "video frozen", "video frozen {seconds:.0f} s",
               {"seconds": "s"},
-              "in flight, if the image has contrast, one of: identical frames for 1.5 s; no image "
-              "motion over 2 m of flight at 1.5 m/s or more (EKF's velocity); none for 3 s (high "
-              "up for 2 s + 0.027 s per metre of ground across the image)",
+              "in flight, if the image has contrast: identical frames for 1.5 s; or no image "
+              "motion over 2 m of flight at 1.5 m/s or more (EKF's velocity), or for 3 s (high "
+              "up: 2 s + 0.027 s per metre of ground across the image)",
               "the image moves for 2 s",
               "camera or link repeat a frame: the position stands still",
               _TAKE_OVER, action=OutputAction.EXCLUDE_AND_RESET, clear_s=2.0),

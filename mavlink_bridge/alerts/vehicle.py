@@ -24,10 +24,10 @@ _NO_LINK = "no fix reaches the autopilot; the text comes only over `bridge.groun
 _AS_BEFORE = "nothing changes: a gimbal that follows a target goes on"
 _MOUNT = "check the gimbal's MNT1 parameters"
 _SENT_OR_NOT = (
-    "*injecting*: fixes are sent, and the EKF flies on them if its source set is vision; *nothing "
-    "is injected*: it has no position"
+    "*injecting*: fixes are sent, and the EKF uses them if its source set is vision; *nothing is "
+    "injected*: it has no position"
 )
-_SELECT = "*injecting*: select the vision source set, unless selected; *nothing is injected*: "
+_SELECT = "if injecting, select the vision source set, unless it is selected; otherwise take over"
 
 VEHICLE: tuple[AlertSpec, ...] = (
     event(A.FC_FOUND, INFO, "flight controller found", {}, "the autopilot's first heartbeat",
@@ -51,7 +51,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
               "GNSS had a 3D fix, and has none for 1 s (brief ones do not reset the count), or no "
               "report came for 2.5 s",
               "`gnss_back`", _SENT_OR_NOT,
-              f"{_SELECT}{_TAKE_OVER}"),
+              _SELECT),
     event(A.GNSS_BACK, INFO, "GNSS is back", {},
           "after `gnss_lost`: a 3D fix for 5 s, and no `gnss_refused`",
           "GNSS can be used again; the program selects it only as `source_set_selected` says",
@@ -60,7 +60,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "at arming, or when the program meets an armed vehicle: the newest GNSS report "
           "has no 3D fix or is over 1.5 s old",
           _SENT_OR_NOT,
-          f"on the ground: do not take off unless planned; in flight: {_SELECT}{_TAKE_OVER}"),
+          f"on the ground: do not take off unless planned; in flight: {_SELECT}"),
     event(A.SENDER_IGNORED, WARNING, "MAVLink of {sender} ignored", {"sender": "name"},
           "UDP: MAVLink arrives from another host or port than `bridge.sender` or, if not set, the "
           "first autopilot (`bridge.ground_connection`: the first ground station, until it is "
@@ -74,7 +74,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "set `bridge.camera.gimbal_component` and `gimbal_device` to the camera's gimbal"),
     event(A.SECOND_COMPANION, WARNING, "another companion is component {component}",
           {"component": "id"}, "a heartbeat with this program's own ids is received; once",
-          "another program uses the same ids, and may send fixes too; this one goes on",
+          "another program uses the same ids, and may send fixes too",
           f"{_TAKE_OVER}; stop one of them"),
     event(A.DUPLICATE_SYSTEM_ID, WARNING, "two autopilots have system id {system}",
           {"system": "id"},
@@ -181,7 +181,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "add yours to `bridge.ground_systems`, or sign their links"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
           "the ground station gives the position; N: its sigma, at least 10 m, without one 100 m",
-          "searches of the next 2 min look only within 2 N; it is never a fix", NOTHING),
+          "searches of the next 2 min look only within 2 N", NOTHING),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
           "the given position is over two of its sigmas off the map",
           "the search ignores it", "give a position on the map"),
