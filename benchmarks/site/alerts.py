@@ -43,8 +43,7 @@ after 1.5 s (up to 60 s if the alert recurs): after *not sent* and *not ready* `
 *EKF check* `the EKF follows`, after a localization status the next one.
 
 **Repetition:** a text is sent when its alert begins, and again while it lasts only where its row
-says *every N s*; *once*: not again before a restart. A localization status that comes back is sent
-every 10 s at most.
+says *every N s*; *once*: not again before a restart.
 
 **Times:** "for 2 s" means all the time. A check without data (no fix for 1 s, no frame for 2 s, no
 IMU messages) leaves its alert as it is. "More than A, and more than B": both.

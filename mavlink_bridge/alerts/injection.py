@@ -12,7 +12,8 @@ _TAKE_OVER = "take over"
 _DOCTOR = "after landing run `companion doctor`"
 _LANDMARKS = "check landmarks"
 _MAP = "check map and calibration"
-_UNVERIFIED = "not verified yet"
+_UNVERIFIED = "not verified yet, and not sent"
+_SENT_UNVERIFIED = "unverified fixes are sent"
 _NOT_USED = "the EKF uses no fix"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
@@ -114,14 +115,14 @@ INJECTION: tuple[AlertSpec, ...] = (
               "injection does not start without GNSS", _MAP, lead=_NOT_READY),
     event(A.INJECTION_FORCED, WARNING, "injection forced, no shadow check", {},
           "`bridge.injection.force` starts injection without a valid pass, or although an alert "
-          "inhibits", _UNVERIFIED,
+          "inhibits", _SENT_UNVERIFIED,
           f"{_LANDMARKS}; land, unless this flight tests `force`, and remove it"),
     event(A.INJECTION_NOT_READY, WARNING, "injecting although not ready", {},
           "mode rc: the pilot enables injection without a valid pass, or although an alert "
-          "inhibits", _UNVERIFIED, _LANDMARKS),
+          "inhibits", _SENT_UNVERIFIED, _LANDMARKS),
     event(A.INJECTION_UNCHECKED, WARNING, "injecting without shadow check", {},
           "mode inject: injection starts without a valid pass, because GNSS had no 3D fix for 2 "
-          "s, the check has not failed, and no alert inhibits", _UNVERIFIED, _LANDMARKS),
+          "s, the check has not failed, and no alert inhibits", _SENT_UNVERIFIED, _LANDMARKS),
     event(A.INJECTION_ON, NOTICE, "injection on ({by})", _BY,
           "mode rc: RC channel or command (BY) enables injection",
           "fixes are sent", NOTHING),
