@@ -24,8 +24,8 @@ _NO_LINK = "no fix reaches the autopilot; the text comes only over `bridge.groun
 _AS_BEFORE = "nothing changes: a gimbal that follows a target goes on"
 _MOUNT = "check the gimbal's MNT1 parameters"
 _SENT_OR_NOT = (
-    "*injecting*: fixes are sent, and the EKF uses them if its source set is vision; *nothing is "
-    "injected*: it has no position"
+    "*injecting*: fixes are sent, and the EKF uses them if its source set is vision (PX4, "
+    "gps_input: always); *nothing is injected*: it has no position"
 )
 _SELECT = "if injecting, select the vision source set, unless it is selected; otherwise take over"
 
@@ -66,8 +66,7 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "first autopilot (`bridge.ground_connection`: the first ground station, until it is "
           "silent for 10 s); SENDER: its host; each once, four at most",
           "it is ignored; if it is the autopilot's, no fix reaches it",
-          "set `bridge.sender` to the autopilot's address; find the sender, perhaps another port "
-          "of its host"),
+          "set `bridge.sender` to the autopilot's address; find the sender"),
     event(A.GIMBAL_IGNORED, WARNING, "gimbal {component}, device {device} ignored",
           {"component": "id", "device": "id"}, "a second gimbal reports its attitude; once",
           "only the first gimbal's angles are used, while it sends",
@@ -134,8 +133,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
     event(A.SOURCE_SET_SELECTED, WARNING, "EKF source set {source_set}: {cause}",
           {"source_set": "", "cause": (GnssProblem, ReturnCause), "metres": "m"},
           "`bridge.switch.enabled`: the program selects a set. Vision: GNSS was lost, glitched or "
-          "far from vision for 1.5 s, fixes are sent, and `source_set_held` does not apply. GNSS, "
-          "unless the pilot selected vision: with `return_to_gnss` after 5 s of agreement with "
+          "over 5 sigma from vision for 1.5 s, fixes are sent, and `source_set_held` does not "
+          "apply. GNSS, unless the pilot selected vision: with `return_to_gnss` after 5 s of agreement with "
           "vision and IMU; or (*vision lost*) no fix was sent for 3 s, and GNSS worked for 3 s, "
           "within 25 m of the EKF and not refused",
           "the EKF uses this set, unless `source_set_refused` follows", _LANDMARKS),
@@ -146,9 +145,9 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "select the set that `source_set_selected` named"),
     condition(A.SOURCE_SET_HELD, WARNING, "no switch: {cause}, {why}",
               {"cause": GnssProblem, "metres": "m", "why": (SwitchRefusal, ChosenSet)},
-              "GNSS is lost, glitches or is far from vision for 1.5 s, but vision must not be "
-              "selected (`bridge.switch.enabled`); repeated every 10 s, "
-              "its end is not sent", WHILE,
+              "with `bridge.switch.enabled`, GNSS is lost, glitches or is over 5 sigma from vision "
+              "for 1.5 s, but vision must not be selected; repeated every 10 s, its end is not "
+              "sent", WHILE,
               "the EKF stays on its set. *not ready*: no valid pass, or an alert inhibits; *EKF "
               "with GNSS*: it is nearer to GNSS than to vision; *set N chosen*: by the pilot",
               "select the source that landmarks confirm"),
