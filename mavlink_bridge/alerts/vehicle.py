@@ -134,9 +134,9 @@ VEHICLE: tuple[AlertSpec, ...] = (
           {"source_set": "", "cause": (GnssProblem, ReturnCause), "metres": "m"},
           "`bridge.switch.enabled`: the program selects a set. Vision: GNSS was lost, glitched or "
           "over 5 sigma from vision for 1.5 s, fixes are sent, and `source_set_held` does not "
-          "apply. GNSS, unless the pilot selected vision: with `return_to_gnss` after 5 s of agreement with "
-          "vision and IMU; or (*vision lost*) no fix was sent for 3 s, and GNSS worked for 3 s, "
-          "within 25 m of the EKF and not refused",
+          "apply. GNSS, unless the pilot selected vision: with `return_to_gnss` after 5 s of "
+          "agreement with vision and IMU; or (*vision lost*) no fix was sent for 3 s, and GNSS "
+          "worked for 3 s, within 25 m of the EKF and not refused",
           "the EKF uses this set, unless `source_set_refused` follows", _LANDMARKS),
     event(A.SOURCE_SET_REFUSED, WARNING, "source switch refused", {},
           "the autopilot refuses the program's command to select a source set",
