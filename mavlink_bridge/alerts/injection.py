@@ -12,38 +12,42 @@ _TAKE_OVER = "take over"
 _DOCTOR = "after landing run `companion doctor`"
 _LANDMARKS = "check landmarks"
 _MAP = "check map and calibration"
-_UNVERIFIED = "not verified yet"
+_UNVERIFIED = "not verified yet, and not sent"
+_SENT_UNVERIFIED = "unverified fixes are sent"
 _NOT_USED = "the EKF uses no fix"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
 
 INJECTION: tuple[AlertSpec, ...] = (
     event(A.INJECTING, INFO, "injecting", {},
-          "injection starts, or a *not sent* alert has ended",
+          "injection sends its first fix, or *not sent* has ended for 1.5 s",
           "the autopilot receives fixes", NOTHING),
     condition(A.NO_FIX_YET, WARNING, "no fix yet", {},
-              "no fix has passed the checks yet; no text, only `inject_reason` in health.json",
+              "no fix has passed the checks since the start; no text, only `inject_reason` in "
+              "health.json",
               WHILE, "vision has found no position, or its fixes are held", _TAKE_OVER,
               lead=_NOT_SENT),
     condition(A.NO_FRESH_FIX, WARNING, "no fresh fix", {},
-              "nothing was sent for 1 s: the newest checked fix is older than "
+              "nothing was sent for 1 s, because the newest checked fix is older than "
               "`bridge.injection.delay_ms` + 0.5 s, or none came for twice the usual interval",
               "a fix passes the checks",
-              "vision makes no fix, or fixes are held or dropped (`fixes_not_checked`)",
+              "vision makes no fix (a localization text says why), or fixes are held or dropped "
+              "(`fixes_not_checked`)",
               f"act on an active \"output held\"; otherwise {_TAKE_OVER}",
               lead=_NOT_SENT),
     condition(A.LINK_FULL, WARNING, "the link takes no more", {},
-              "injection is on, and the port is full for 1 s", WHILE,
+              "injection is on, and for 1 s the port to the autopilot takes no fix", WHILE,
               "the connection is too slow or broken", f"{_TAKE_OVER}; check cable and baud rate",
               lead=_NOT_SENT),
     condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
               "injection is on with message external_position_estimate, and for 2 s the autopilot "
               "has not accepted this command", WHILE,
               "*not asked, no GNSS*: a test command follows when the EKF uses GNSS; other answers: "
-              "this firmware does not use it",
+              "this firmware does not use it, and is not asked again before it reboots",
               f"{_TAKE_OVER}; if not asked wait for GNSS, else set another message",
               lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {},
-              "GPS_GLOBAL_ORIGIN is missing (messages vision_position_estimate, odometry)", WHILE,
+              "with message vision_position_estimate or odometry, the autopilot sends no "
+              "GPS_GLOBAL_ORIGIN", WHILE,
               "positions in these messages are relative to the origin",
               f"{_TAKE_OVER}; set the origin at the ground station, or `bridge.origin`",
               lead=_NOT_SENT),
@@ -51,7 +55,7 @@ INJECTION: tuple[AlertSpec, ...] = (
               {"kilometres": "km"}, "the EKF origin is over 100 km from a fix", WHILE,
               "origin or map is wrong", f"{_TAKE_OVER}; check both", lead=_NOT_SENT),
     condition(A.NO_ATTITUDE, WARNING, "no attitude for ODOMETRY", {},
-              "ATTITUDE is missing for the time of a fix (message odometry)", WHILE,
+              "with message odometry, ATTITUDE is missing for the time of a fix", WHILE,
               "ODOMETRY must contain the attitude",
               f"{_TAKE_OVER}; check the rate of ATTITUDE", lead=_NOT_SENT),
     condition(A.SIGMA_OVER_LIMIT, WARNING, "sigma {metres:.1f} m over limit", {"metres": "m"},
@@ -62,27 +66,28 @@ INJECTION: tuple[AlertSpec, ...] = (
               lead=_NOT_SENT),
     condition(A.YAW_MISMATCH, WARNING, "vision yaw {degrees:+.0f} deg off autopilot",
               {"degrees": "deg"},
-              "in three of the last five fixes vision's yaw is over 20 deg off the autopilot's, or "
-              "turned over 3.5 deg unlike the gyros (without a good fix for 60 s: is over 3.5 deg "
-              "off the autopilot's)",
-              "five fixes in a row are within 70 % of the limits",
+              "in three of five fixes vision's yaw is over 20 deg off the autopilot's, or turned "
+              "over 3.5 deg unlike the gyros; at the start, or after 60 s without a good fix, is "
+              "over 3.5 deg off the autopilot's",
+              "five fixes in a row are within 2.5 in place of 3.5 deg",
               "compass, camera mounting or map is rotated; N: vision minus autopilot, small if "
               "only the turn is wrong",
               f"{_TAKE_OVER}; check compass and camera mounting", lead=_NOT_SENT),
     condition(A.INHIBITED, WARNING, "{alert}", {"alert": A},
-              "an alert that inhibits (ALERT) prevents injection in mode inject, although fixes "
-              "are made for 10 s", WHILE,
+              "in mode inject, before injection, an alert that inhibits (ALERT: `focal_length`, "
+              "`boresight`, `time_offset`) is active, although fixes are made for 10 s", WHILE,
               "injection does not start", f"act on that alert; {_TAKE_OVER}", lead=_NOT_SENT),
     condition(A.SHADOW_NOT_COMPARED, WARNING, "no fix compared with GNSS", {},
-              "no fix was compared", WHILE,
-              _UNVERIFIED, "wait; check that GNSS has a 3D fix", lead=_NOT_READY),
+              "no fix of the last 2 min was compared", WHILE,
+              f"{_UNVERIFIED}: no fix, or the EKF does not use GNSS",
+              "wait; check that GNSS has a 3D fix", lead=_NOT_READY),
     condition(A.SHADOW_FEW_FIXES, WARNING, "{fixes:.0f} of {needed:.0f} fixes",
               {"fixes": "fixes", "needed": "fixes"},
-              "fewer than 50 fixes were compared", WHILE, _UNVERIFIED, "wait",
+              "fewer than 50 fixes of the last 2 min were compared", WHILE, _UNVERIFIED, "wait",
               lead=_NOT_READY),
     condition(A.SHADOW_RATE, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.0f}",
               {"hertz": "Hz", "needed": "Hz"},
-              "fewer than 4 fixes a second were compared", WHILE,
+              "fewer than 4 fixes a second were compared, and nothing else fails", WHILE,
               "there are too few fixes for the EKF", "check the computer's load",
               lead=_NOT_READY),
     condition(A.SHADOW_MEDIAN, WARNING, "median error {metres:.1f} m", {"metres": "m"},
@@ -99,23 +104,25 @@ INJECTION: tuple[AlertSpec, ...] = (
               "geoid, vertical datum or barometer is wrong", _MAP,
               lead=_NOT_READY),
     condition(A.SHADOW_YAW, WARNING, "yaw differs by {degrees:+.1f} deg", {"degrees": "deg"},
-              "`yaw_mismatch` is active, which is the text then",
-              "it has ended, and 50 fixes are compared",
+              "`yaw_mismatch` was active (until its end this is the text)",
+              "50 fixes of the last 2 min are compared",
               "compass or camera mounting is wrong",
               "check compass and camera mounting", lead=_NOT_READY),
     condition(A.SHADOW_RESTORED, WARNING, "failed before the restart", {},
-              "the check had failed in a process that crashed or was killed at most 10 min ago",
-              "the check passes", "the failure stands", _MAP, lead=_NOT_READY),
+              "at a restart: with this map the check had failed, before injection, in a process "
+              "that crashed or was killed at most 10 min ago",
+              "50 fixes are compared, with their own result", "the failure stands until then; "
+              "injection does not start without GNSS", _MAP, lead=_NOT_READY),
     event(A.INJECTION_FORCED, WARNING, "injection forced, no shadow check", {},
           "`bridge.injection.force` starts injection without a valid pass, or although an alert "
-          "inhibits", _UNVERIFIED,
+          "inhibits", _SENT_UNVERIFIED,
           f"{_LANDMARKS}; land, unless this flight tests `force`, and remove it"),
     event(A.INJECTION_NOT_READY, WARNING, "injecting although not ready", {},
           "mode rc: the pilot enables injection without a valid pass, or although an alert "
-          "inhibits", _UNVERIFIED, _LANDMARKS),
+          "inhibits", _SENT_UNVERIFIED, _LANDMARKS),
     event(A.INJECTION_UNCHECKED, WARNING, "injecting without shadow check", {},
           "mode inject: injection starts without a valid pass, because GNSS had no 3D fix for 2 "
-          "s, the check has not failed, and no alert inhibits", _UNVERIFIED, _LANDMARKS),
+          "s, the check has not failed, and no alert inhibits", _SENT_UNVERIFIED, _LANDMARKS),
     event(A.INJECTION_ON, NOTICE, "injection on ({by})", _BY,
           "mode rc: RC channel or command (BY) enables injection",
           "fixes are sent", NOTHING),
@@ -128,15 +135,17 @@ INJECTION: tuple[AlertSpec, ...] = (
           "enabled", "fixes are sent", NOTHING),
     event(A.JUMP_REPEATED, NOTICE, "the EKF missed a jump: announced again", {},
           "after `reset_counter` incremented, the EKF is still over 1 m + 3 sigma off the fixes",
-          "the next fix increments it again, five times at most", NOTHING),
+          "the EKF has not jumped to the fixes; the next one increments it again, five times at "
+          "most", NOTHING),
     event(A.EKF_FOLLOWS, INFO, "the EKF follows", {},
-          "no EKF check fails: 3 s after the first fix is sent, after such an alert or `ekf_jump` "
-          "has ended, or 3.5 s after a jump of the fixes, once the EKF is within 1 m + 3 sigma",
+          "no *EKF check* fails, and `ekf_jump` is not active: 3 s after the first sent fix, after "
+          "the end of such an alert, or 3.5 s after `reset_counter` incremented, once the EKF is "
+          "within 1 m + 3 sigma",
           "the EKF is where the fixes are", NOTHING),
     condition(A.FIX_RATE_LOW, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.1f}",
               {"hertz": "Hz", "needed": "Hz"},
-              "positions are sent at less than 4 Hz (gps_input: 4.65 Hz; EKF check)", WHILE,
-              "the EKF may stop using them",
+              "positions are sent at less than 4 Hz (message gps_input: 4.65 Hz; EKF check)", WHILE,
+              "they are sent, but the EKF may stop using them",
               f"{_LANDMARKS}; on the ground check the computer's load"),
     condition(A.EKF_NOT_INITIALISED, WARNING, "the EKF is not initialised yet", {},
               "ArduPilot's EKF flag EKF_UNINITIALIZED is set (EKF check)", WHILE, _NOT_USED,
@@ -159,22 +168,24 @@ INJECTION: tuple[AlertSpec, ...] = (
               {"age_ms": "ms", "limit_ms": "ms"},
               "each of the last 50 fixes (not ArduPilot: their median) is over "
               "`bridge.injection.delay_ms` + 10 ms old when made",
-              "below 90 % of it for 15 s (`fixes_in_time`)",
-              "the EKF takes them for newer",
+              "for 15 s the age is below 90 % of it; `fixes_in_time` follows",
+              "fixes are sent, but the EKF takes them for newer",
               f"{_LANDMARKS}; on the ground raise delay_ms and the autopilot's delay"),
     condition(A.FIXES_OVER_LIMIT, WARNING, "fixes {age_ms:.0f} ms old, limit {limit_ms:.0f}",
               {"age_ms": "ms", "limit_ms": "ms"},
               "the median age of 50 fixes is above what the firmware can use (250 ms, PX4 300 ms)",
-              "below 90 % of it for 15 s (`fixes_in_time`)",
-              "fixes are extrapolated by up to 0.5 s; older ones are not sent",
+              "for 15 s it is below 90 % of it; `fixes_in_time` follows",
+              "in their place positions extrapolated by up to 0.5 s are sent",
               f"{_LANDMARKS}; on the ground use a faster computer or a smaller `localizer.width`"),
     event(A.FIXES_IN_TIME, INFO, "fixes are in time again", {},
-          "no late fix for 15 s", "delay_ms is right again",
+          "after `fixes_late` or `fixes_over_limit`: no late fix for 15 s",
+          "fixes are young enough again",
           NOTHING),
     condition(A.YAW_UNCHECKED, WARNING, "yaw not checked: no attitude or gimbal", {},
               "for 20 fixes in a row the attitude or the gimbal angles are missing",
               "a fix has both",
-              "a wrong yaw would not be detected; an active `yaw_mismatch` stays",
+              "fixes are sent, but a wrong yaw would not be detected; an active `yaw_mismatch` "
+              "stays",
               f"{_LANDMARKS}; after landing check the rates of these messages",
               "vision yaw is checked"),
     condition(A.CLOCK_NOT_SET, WARNING, "clock not set: GPS_INPUT has no time", {},
@@ -182,6 +193,6 @@ INJECTION: tuple[AlertSpec, ...] = (
               "a restart with a set clock",
               "fixes are sent without a time", "set the clock and restart"),
     event(A.TLOG_INCOMPLETE, WARNING, "tlog incomplete: {why}", {"why": "name"},
-          "the .tlog (`bridge.tlog`) cannot be written, or has 2 GiB",
-          "MAVLink messages are not recorded", "check the disk"),
+          "the .tlog (`bridge.tlog`) cannot be written, or has 2 GiB; once",
+          "MAVLink messages from then on are missing in it", "check the disk"),
 )  # fmt: skip
