@@ -130,7 +130,9 @@ class GroundLink:
     # --- parameters --------------------------------------------------------------------------
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter and wait until the vehicle confirms it; `PilotError` if it does not."""
+        """Set a vehicle's parameter and wait until the vehicle confirms it. `PilotError` if no
+        confirmation comes, for example because the vehicle has no such parameter.
+        """
         with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(_TRIES):
                 self.send(
@@ -180,7 +182,9 @@ class GroundLink:
     # --- commands ----------------------------------------------------------------------------
 
     def command(self, number: int, *parameters: float) -> None:
-        """Send COMMAND_LONG and wait for its answer; `PilotError` unless it is accepted."""
+        """Send COMMAND_LONG with parameters 1 to 7 (missing ones are 0) and wait for its answer.
+        `PilotError` without an answer, or if it is not accepted.
+        """
         started = time.monotonic_ns()
         result = self.try_command(number, *parameters)
         if result != mavlink.MAV_RESULT_ACCEPTED:

@@ -73,7 +73,9 @@ class ContentFile:
         return [transform_mesh(m, T) for m in meshes]
 
     def corners(self) -> Array:
-        """(N, 3) ECEF corners of boxes that hold the content, by the file's headers."""
+        """(N, 3) ECEF corners, m, of boxes that hold the content, by the file's headers where they
+        state them. `MapSourceError` if the file is malformed.
+        """
         data, rtc = self._gltf()
         corners, gltf_rtc = gltf_bounds(data, self._beside, self.rules)
         T = self._ecef_from_gltf(rtc + gltf_rtc)
