@@ -130,9 +130,7 @@ class GroundLink:
     # --- parameters --------------------------------------------------------------------------
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a vehicle's parameter and wait until the vehicle confirms it. `PilotError` if no
-        confirmation comes, for example because the vehicle has no such parameter.
-        """
+        """Set a parameter and wait until the vehicle confirms it; `PilotError` if it does not."""
         with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(_TRIES):
                 self.send(
@@ -182,7 +180,7 @@ class GroundLink:
     # --- commands ----------------------------------------------------------------------------
 
     def command(self, number: int, *parameters: float) -> None:
-        """Send COMMAND_LONG with parameters 1 to 7 (missing ones are 0) and wait for its answer.
+        """Send COMMAND_LONG with parameters 1 to 7 (missing: 0) and wait for its answer.
         `PilotError` without an answer, or if it is not accepted.
         """
         started = time.monotonic_ns()

@@ -110,10 +110,7 @@ class AidedFilter:
             self._last_yaw_source = yaw
 
     def check_gps(self, gps: GpsData) -> None:
-        """Apply EKF3's checks to a newly received fix, and set `gated.gps_fix_good`: whether all
-        fixes were good for long enough, with gaps of at most 1 s. The first such fix sets a missing
-        origin.
-        """
+        """EKF3's receiver checks of a new fix: sets `gated.gps_fix_good`, and a missing origin."""
         now = self.gated.now_ms
         if not gps.good or now - self.gated.clock.gps_received > 1000:
             self.gated.clock.gps_bad = now
