@@ -121,8 +121,8 @@ class RecordTables:
 
     @property
     def tlog(self) -> Path | None:
-        """Path of the flight's .tlog: as in the settings, otherwise in the record or beside it; as
-        in the settings, too, if it is nowhere. None if flown without one.
+        """Path of the flight's .tlog: where the settings name it, otherwise in the record or beside
+        it. If no such file exists, the path of the settings. None if the flight wrote none.
         """
         named = self._setting("bridge", "tlog")
         if not isinstance(named, str):

@@ -37,9 +37,7 @@ def decode_value(value: float, kind: int, *, bytewise: bool) -> float:
 
 
 def encode_value(value: float, kind: int, *, bytewise: bool) -> float:
-    """The float to send in PARAM_SET for a parameter's value; the inverse of `decode_value`. kind:
-    MAV_PARAM_TYPE.
-    """
+    """The float to send in PARAM_SET for a parameter's value: the inverse of `decode_value`."""
     if bytewise and kind in _INTEGER_FORMATS:
         raw = struct.pack(_INTEGER_FORMATS[kind], round(value))
         return float(struct.unpack("<f", raw)[0])

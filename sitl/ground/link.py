@@ -180,9 +180,7 @@ class GroundLink:
     # --- commands ----------------------------------------------------------------------------
 
     def command(self, number: int, *parameters: float) -> None:
-        """Send COMMAND_LONG with parameters 1 to 7 (missing: 0) and wait for its answer.
-        `PilotError` without an answer, or if it is not accepted.
-        """
+        """Send COMMAND_LONG and wait for its answer; `PilotError` unless it is accepted."""
         started = time.monotonic_ns()
         result = self.try_command(number, *parameters)
         if result != mavlink.MAV_RESULT_ACCEPTED:

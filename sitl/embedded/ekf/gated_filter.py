@@ -180,8 +180,8 @@ class GatedFilter:
         self.clock.velocity_pass = self.now_ms
 
     def update_innovation_status(self) -> None:
-        """Update `innovations_good`: False after 1 s outside the gate, True again after 10 s
-        inside.
+        """Update `innovations_good`: False after 1 s in which position or velocity was outside the
+        gate, True again after 10 s with both inside.
         """
         clock, now = self.clock, self.now_ms
         if self.ratios.position < 1.0 and self.ratios.velocity < 1.0:
