@@ -23,7 +23,7 @@ class GrowthModel:
     registration: float = 1.0  # variance factor of each registration's covariance
     # Height, tilt and the map's shape correct the pose's other axes, and the part of the position
     # that is correlated with them. Nothing corrects the rest of the position: without this walk,
-    # frames by night (quality 0.65) were 12.8 m off with a sigma of 1.8 m, and 39 of 100 were inside
+    # a night of quality 0.65 was 12.8 m off with a sigma of 1.8 m, and 39 of 100 frames were inside
     # their 95 % bound.
     unmatched: float = 0.0  # uncorrected walk of east and north, m per root m, times (1 - quality)
 
