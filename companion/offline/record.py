@@ -98,7 +98,9 @@ class RecordTables:
 
     @property
     def flown_map(self) -> FlownMap:
-        """The record's data about its map."""
+        """Identity of the map that was flown: its hash, and one estimate as latitude, longitude,
+        height and as ENU, which shows the map's frame. Each is missing if the record lacks it.
+        """
         named = self.manifest.get("map_sha256")
         sha256 = named if isinstance(named, str) else None
         columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]

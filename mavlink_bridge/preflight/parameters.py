@@ -52,7 +52,9 @@ class ParameterClient(VehicleClient):
         self._values: dict[str, tuple[float, int]] = {}
 
     def read(self, name: str) -> float | None:
-        """The parameter's value; None if it does not exist, or no answer comes in 2 s."""
+        """Request a parameter from the vehicle, and return its value; None if it does not exist, or
+        no answer comes in 2 s.
+        """
         self._values.pop(name, None)
         request = mavlink.MAVLink_param_request_read_message(
             self.system, self.component, name.encode("ascii"), -1

@@ -66,7 +66,9 @@ class ContentFile:
         return gltf_weight(self._gltf()[0], self._beside, self.rules)
 
     def load(self) -> list[SourceMesh]:
-        """Meshes with positions in ECEF metres (float64)."""
+        """Read the file's meshes; positions in ECEF metres (float64). `MapSourceError` if the file
+        is malformed or exceeds a limit.
+        """
         data, rtc = self._gltf()
         meshes, gltf_rtc = read_gltf(data, self._beside, self.rules)
         T = self._ecef_from_gltf(rtc + gltf_rtc)
