@@ -82,7 +82,9 @@ def heading(ned_from_body: Array) -> float:
 
 
 def gimbal_attitude(ned_from_body: Array, gimbal: GimbalAngles) -> Array:
-    """Rotation (3, 3) NED from gimbal. ned_from_body: (3, 3)."""
+    """Rotation (3, 3) NED from gimbal, from the gimbal's reported angles in whichever frame they
+    are. ned_from_body: (3, 3), the vehicle's attitude.
+    """
     R = matrix_from_euler(gimbal.roll_rad, gimbal.pitch_rad, gimbal.yaw_rad)
     if gimbal.frame is GimbalFrame.EARTH:
         return R

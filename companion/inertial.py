@@ -92,8 +92,10 @@ class InertialTrack:
                 self.add(sample, vehicle.attitude_at)
 
     def add(self, sample: InertialSample, attitude_at: Callable[[int], Attitude | None]) -> None:
-        """Integrate one sample; not thread-safe. It is ignored if it is not newer than the last or
-        the autopilot's attitude is unknown then. After 0.3 s without samples the integral restarts.
+        """Integrate one sample of specific force and turn rates; to be called by one thread only.
+        attitude_at: the autopilot's attitude at a time (ns). A sample is ignored if it is not newer
+        than the last, or if the attitude is unknown at its time. After 0.3 s without samples the
+        integral restarts.
         """
         reference = attitude_at(sample.time_ns)
         if reference is None or sample.time_ns <= self.newest_ns:

@@ -16,7 +16,9 @@ _PACKAGES = ("pilot-companion", "numpy", "numba", "onnxruntime", "openvino",
 
 
 def versions() -> dict[str, str]:
-    """Package name to version; unknown ones are left out."""
+    """Version of Python and of each package that affects results, and the machine type; packages
+    that are not installed are left out.
+    """
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for name in _PACKAGES:
         try:

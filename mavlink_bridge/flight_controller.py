@@ -107,9 +107,10 @@ class FlightControllerEnd:
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
     def on_gnss(self, now_ns: int) -> bool | None:
-        """Whether the EKF uses GNSS; None if its source set is unknown. With a message that is the
-        EKF's receiver or fused beside GNSS, and on PX4, which has no source sets: False if the set
-        is unknown, or a fix was sent in the last 10 s.
+        """Whether the EKF takes its position from GNSS; None if its source set is unknown. Fixes
+        may also feed the EKF beside GNSS or as its receiver (by the configured message; on PX4,
+        which has no source sets, always). Then the answer is False if the set is unknown, or if a
+        fix was sent in the last 10 s.
         """
         current = self.sources.current
         unswitched = ("gps_input", *WITHOUT_SOURCE_SET)

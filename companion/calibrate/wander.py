@@ -35,9 +35,10 @@ class GaussMarkovProcess:
     memory_s: Array
 
     def whitened(self, values: Array, times_s: Array, white: float) -> Array:
-        """Residuals (K, 3, n) without the part predicted from earlier ones, in sigmas: (3 K, n).
+        """Residuals (K, 3, n) at times_s (K,), without the part that is predicted from earlier
+        ones, in sigmas: (3 K, n).
 
-        white: sigma of uncorrelated noise.
+        white: sigma of uncorrelated noise, in the unit of the residuals.
         """
         gaps = np.diff(times_s)[:, None]
         kept = np.concatenate([np.zeros((1, 3)), np.exp(-gaps / self.memory_s)])

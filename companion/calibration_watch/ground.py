@@ -44,7 +44,9 @@ class GroundView:
         return max(known, default=None)
 
     def width_m(self, state: VehicleState, now_ns: int) -> float:
-        """Width of the ground in the frame at now_ns, m; with unknown height as from 100 m."""
+        """Width of the ground that the frame at now_ns shows, m. If the height above ground is
+        unknown, it is taken as 100 m.
+        """
         newest = self._newest
         if newest is not None and now_ns - newest.time_ns < _HOLDS_NS:
             return newest.depth_m * _width_ratio(newest.horizontal_fov_deg)

@@ -38,9 +38,10 @@ def read_for_page(path: Path, editable: bool) -> dict[str, Any]:
 
 
 def check(path: Path, text: str) -> CompanionConfig:
-    """Check the text as a deployment at `path`; `ConfigError` names what is wrong.
+    """Check a text as the deployment file at `path`, and return its configuration; `ConfigError`
+    names what is wrong.
 
-    It is read from a file beside the real one, since relative paths begin there.
+    The text is read from a temporary file beside the real one, because relative paths begin there.
     """
     if len(text.encode()) > _MOST_BYTES:
         raise ConfigError(f"over {_MOST_BYTES >> 10} KiB; that is no deployment")

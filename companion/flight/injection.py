@@ -48,7 +48,9 @@ class JumpCounter:
         self._state = TrackingState.INITIALIZING
 
     def add_state(self, state: TrackingState) -> None:
-        """Add the tracking state of the next frame, in order; `count` may grow."""
+        """Add the tracking state of the next frame, in order. `count` grows by one when the
+        position is lost, and when the map matches again after BRIDGING.
+        """
         before, self._state = self._state, state
         is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
         found_again = before is TrackingState.BRIDGING and state is TrackingState.TRACKING

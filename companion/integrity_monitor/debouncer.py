@@ -45,7 +45,11 @@ class AlertDebouncer:
         self._reported_ns = 0
 
     def update(self, now_ns: int, result: CheckResult) -> Alert | None:
-        """Add a result; returns the alert to report now (raised, cleared, repeated), if any."""
+        """Add a check's result at now_ns; returns the alert to report now, if any. An alert is
+        raised after the result was bad for `raise_s`, cleared after it was good for `clear_s`, and
+        repeated while it lasts. A result without evidence (bad is None) changes nothing, and its
+        time does not count.
+        """
         silent_ns, self._updated_ns = now_ns - self._updated_ns, now_ns
         if result.bad is None:
             if not self.raised:

@@ -36,7 +36,9 @@ class EkfDisplacement:
         self._way: deque[tuple[int, Metres, Metres]] = deque(maxlen=_KEPT)  # time, velocity, way
 
     def add(self, state: VehicleState) -> None:
-        """Integrate the EKF's newest velocity. A gap in the timestamps restarts the integral."""
+        """Integrate the EKF's newest velocity (NED, m/s). A state without a velocity or with an old
+        one is ignored; a gap in the timestamps restarts the integral.
+        """
         if state.local_velocity_ned is None:
             return
         north, east, _ = state.local_velocity_ned

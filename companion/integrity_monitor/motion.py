@@ -149,8 +149,8 @@ class StillPosition:
         self._reference: tuple[int, Array] | None = None
 
     def add(self, time_ns: int, here: Array) -> float:
-        """Add a position (2,), m from a point that stays the same; returns for how many seconds it
-        has not moved, 0 during the first.
+        """Add a position (2,), m east and north of a fixed point, of the time time_ns. Returns for
+        how many seconds the position has not moved; 0 during the first block of positions.
         """
         if not self._block:
             self._block_ns = time_ns

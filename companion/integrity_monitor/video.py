@@ -131,7 +131,9 @@ class RepeatedVideoDetector:
         self._matches: deque[tuple[int, int]] = deque()  # time and lag
 
     def add(self, seen: _SeenFrame) -> float:
-        """Add a frame; returns the lag of repeated frames, s, or 0 for new frames."""
+        """Add a frame, in order of its time. Returns the lag (s) at which the newest frames repeat
+        earlier ones, or 0 if they are new.
+        """
         before = [old for old in self._memory if seen.time_ns - old.time_ns >= self._hold_ns]
         for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: difference_gray(old, seen)):
             if shift_between(old, seen) < STILL_SHARE:

@@ -98,7 +98,9 @@ class RecordTables:
 
     @property
     def flown_map(self) -> FlownMap:
-        """The record's data about its map."""
+        """Identity of the map that was flown: its hash, and one estimate as latitude, longitude,
+        height and as ENU, which shows the map's frame. Each is missing if the record lacks it.
+        """
         named = self.manifest.get("map_sha256")
         sha256 = named if isinstance(named, str) else None
         columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]
@@ -121,8 +123,8 @@ class RecordTables:
 
     @property
     def tlog(self) -> Path | None:
-        """Path of the flight's .tlog: as in the settings, otherwise in the record or beside it; as
-        in the settings, too, if it is nowhere. None if flown without one.
+        """Path of the flight's .tlog: where the settings name it, otherwise in the record or beside
+        it. If no such file exists, the path of the settings. None if the flight wrote none.
         """
         named = self._setting("bridge", "tlog")
         if not isinstance(named, str):

@@ -145,7 +145,9 @@ def _localize(
 
 
 def summarize(frames: list[ReplayedFrame]) -> ReplaySummary:
-    """Compare the recorded and the replayed result of every frame."""
+    """Compare the recorded and the replayed result of every frame: counts of accepted frames, and
+    distances (m, degrees) where both are accepted.
+    """
     again = [f.replayed is not None and f.replayed.accepted for f in frames]
     differences = [
         f.recorded.world_from_camera.distance_to(f.replayed.world_from_camera)

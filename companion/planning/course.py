@@ -60,8 +60,8 @@ def straight(start: Array, end: Array) -> Course:
 def spline(
     start: Array, end: Array, arrives: Array, after: Array | None, *, curved_on: bool
 ) -> Course:
-    """A spline between two positions (3,), world metres. arrives: `leaves` of the course before;
-    after: next position, None for a stop; curved_on: whether the next leg is a spline.
+    """A spline leg between two positions (3,), world metres. arrives: `leaves` (3,) of the course
+    before; after: next position, None for a stop; curved_on: whether the next leg is a spline.
     """
     leaves = np.zeros(3)
     if after is not None:
@@ -80,8 +80,8 @@ def spline(
 
 
 def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
-    """One circle about a position (3,), from the point where a vehicle flying in direction
-    `arrives` (3,) meets it; counter-clockwise if the circle's radius is negative.
+    """One circle about a position (3,), world metres, from the point where a vehicle flying in
+    direction `arrives` (3,) meets it; counter-clockwise if the circle's radius is negative.
     """
     begin = np.arctan2(-arrives[1], -arrives[0])
     turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)

@@ -81,7 +81,9 @@ class MapHeights:
         self._known: dict[tuple[float, float], float | None] = {}
 
     def height_m(self, east_m: float, north_m: float) -> float | None:
-        """World z (m) of the highest surface; None outside the map and in holes."""
+        """World z (m) of the highest surface at a position (m from the map's origin); None outside
+        the map and in holes. Each position is measured once and then remembered.
+        """
         place = east_m, north_m
         if place not in self._known:
             self._known[place] = self._measured(east_m, north_m)

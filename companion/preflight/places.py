@@ -12,7 +12,9 @@ from mavlink_bridge.preflight.rules import DoctorFinding
 
 
 def check_places(config: CompanionConfig) -> list[DoctorFinding]:
-    """Findings for folders, keys and console files with which a flight would not start."""
+    """Findings on the folders, signing keys and console files that the configuration names: a
+    flight would not start if one cannot be written or read.
+    """
     bridge = config.bridge
     written = {"bridge.tlog": bridge.tlog}
     faults = []

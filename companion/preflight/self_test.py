@@ -123,7 +123,9 @@ def _write(path: Path, raster: np.ndarray, **profile: float) -> None:
 
 
 def render_view(cache: TileCache, config: LocalizerConfig) -> tuple[Pose, Frame]:
-    """Pose and frame of a view from 100 m above the map's middle."""
+    """Render a view from 100 m above the ground at the map's middle: its pose world_from_camera,
+    and a frame of the configured width as the camera would give it. Its exposure time is 1 s.
+    """
     camera = Camera.from_fov(config.width, config.width * 3 // 4, 60.0)
     middle = cache.frame.position((0.0, 0.0, 0.0))  # a source's centre is its origin
     pose = inspect.camera_pose(

@@ -28,7 +28,9 @@ Row = Mapping[str, Any]
 
 
 def ulog_messages(path: Path) -> Iterator[Dated]:
-    """Yield the messages of a .ulg. `FootageError` without `pyulog` or for another file."""
+    """Yield the MAVLink messages that correspond to the rows of a PX4 log (.ulg), in the order of
+    their times (UTC). `FootageError` without `pyulog`, or if the file is not such a log.
+    """
     try:
         from pyulog import ULog
     except ImportError as error:

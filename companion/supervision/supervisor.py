@@ -329,8 +329,9 @@ def exit_code_text(code: int) -> str:
 
 
 def mark_dead(folder: Path, pid: int, text: str) -> None:
-    """Write the death into the ``health.json`` of process `pid`, in `folder` or a record beside it
-    whose name begins likewise. Without such a file nothing is written; OSError if the disk refuses.
+    """Set the state `failed` with `text` in the health.json of the process `pid`: in `folder`, or
+    in a record beside it whose name begins with the folder's. Does nothing if no such file names
+    the process; OSError if the disk refuses.
     """
     for path in folder.parent.glob(f"{glob.escape(folder.name)}*/health.json"):
         report = _report(path)

@@ -60,7 +60,9 @@ class FrameTimes:
         self._release()
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A new connection restarts the presentation times: drop detections that wait for one."""
+        """Note that a new connection restarts the presentation times. Detections that still wait
+        for a frame by its presentation time are dropped and counted as unmatched.
+        """
         with self._lock:
             self._by_pts.clear()
             kept = deque((d, n) for d, n in self._waiting if n.pts_s is None)

@@ -36,7 +36,10 @@ class Senders:
         self._names: OrderedDict[str, _Named] = OrderedDict()
 
     def name_of(self, target_id: str, sender: Address, now_ns: int) -> str:
-        """The target's name, numbered if senders share it; for each detection. CLOCK_MONOTONIC."""
+        """The name of a detection's target; to be called for each detection. If several senders use
+        the same target_id, each gets a target of its own, whose name has a number. now_ns:
+        CLOCK_MONOTONIC.
+        """
         named = self._names.setdefault(target_id, _Named())
         self._names.move_to_end(target_id)
         if len(self._names) > _NAMES:

@@ -85,7 +85,8 @@ class FrameLocalizer:
 
     def search_map(self, recorded: RecordedFrame, prior: FramePrior) -> Localized:
         """Localize by a search of the whole map, without the frame's position but with its angles
-        and height. Raises nothing for an image that cannot be used.
+        and height (`prior`). For an image that cannot be read the result holds the reason; nothing
+        is raised.
         """
         try:
             frame = self.load(recorded)

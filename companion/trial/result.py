@@ -159,7 +159,9 @@ def spread_limit_m(trial: Trial) -> float:
 
 
 def main_reason(trial: Trial) -> str:
-    """The most frequent reason of failures, as the end of a sentence; "" without failures."""
+    """The most frequent reason why frames failed, as the end of a sentence ("; likely reason ...");
+    "" without failures.
+    """
     if not trial.reasons:
         return ""
     heads = [text.split(":", maxsplit=1)[0] for text in trial.reasons.values()]

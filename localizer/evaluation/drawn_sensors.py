@@ -72,7 +72,9 @@ class DrawnSensors:
         return AuxiliarySensors(rotation_at=rotation_at, height_at=height_at)
 
     def in_prior(self, prior: PosePrior, truth: Pose, index: int) -> PosePrior:
-        """The prior with simulated roll, pitch and height; position and heading are unchanged."""
+        """The prior of frame `index` with simulated roll, pitch and height in place of its own, and
+        their variances; position and heading are unchanged. truth: the frame's world_from_camera.
+        """
         pose, covariance = prior.world_from_camera, prior.covariance.copy()
         rotation, height_m = self.rotation(truth, index), self.height_m(truth, index)
         if rotation is not None and self.tilt_sigma_deg is not None:

@@ -95,7 +95,10 @@ class Perturbation:
     reported: Callable[[PosePrior, Pose, int], PosePrior] = lambda prior, _truth, _index: prior
 
     def prior(self, truth: Pose, index: int, time_ns: int) -> PosePrior:
-        """The true pose, displaced and rotated about random axes by uniform amounts."""
+        """The true pose world_from_camera of frame `index`, moved and rotated about random axes by
+        uniform amounts up to the bounds, as a prior with matching covariance. The same seed and
+        index give the same prior.
+        """
         rng = np.random.default_rng((self.seed, index))
         offset = _random_vector(rng, self.translation_m)
         turn = _random_vector(rng, np.radians(self.rotation_deg))

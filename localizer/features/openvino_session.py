@@ -58,7 +58,9 @@ class OpenVinoSession:
         return self._outputs
 
     def run(self, outputs: list[str], inputs: dict[str, NDArray[np.uint8]]) -> list[Any]:
-        """The named outputs; the arrays belong to the caller."""
+        """Run the network on one image (1, H, W, 3) uint8; returns the outputs in the order of
+        their names `outputs`, float32. The arrays belong to the caller. Waits for the result.
+        """
         (image,) = inputs.values()
         request, shapes = self._request(image.shape)
         found = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}

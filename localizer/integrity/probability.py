@@ -44,7 +44,7 @@ class PlaceModel:
 
 @cache
 def place_model(path: Path = MODEL) -> PlaceModel:
-    """The fitted model of a file, which is read once."""
+    """The fitted model in the JSON file at `path`. Each file is read once, on the first call."""
     data = json.loads(path.read_text(encoding="utf-8"))
     columns = [data["features"][name] for name in FEATURES]
     mean, spread, weights = (

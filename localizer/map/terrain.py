@@ -52,7 +52,9 @@ class TerrainGrid:
     cell_m: float
 
     def height(self, east: Array, north: Array) -> Array:
-        """World z (...) in metres at world places (...), bilinear."""
+        """World z (m) at world positions, by bilinear interpolation; beyond the grid, that of its
+        edge. east, north: metres, arrays of one shape.
+        """
         rows, columns = self.heights.shape
         u = np.clip((np.asarray(east) - self.west) / self.cell_m, 0.0, columns - 1.0)
         v = np.clip((self.north - np.asarray(north)) / self.cell_m, 0.0, rows - 1.0)

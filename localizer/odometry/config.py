@@ -21,9 +21,10 @@ class GrowthModel:
     tilt: float  # walk of roll and pitch, rad per root m
     heading: float  # walk of the heading, rad per root m
     registration: float = 1.0  # variance factor of each registration's covariance
-    # Height, tilt and the map's shape mend a pose's other axes, and with them the place that hangs
-    # on these. What the registrations took for the place itself nobody mends: without this a night
-    # of quality 0.65 was 12.8 m off with a sigma of 1.8 m, inside its 95 % in 39 of 100 frames.
+    # Height, tilt and the map's shape correct the pose's other axes, and the part of the position
+    # that is correlated with them. Nothing corrects the rest of the position: without this walk,
+    # a night of quality 0.65 was 12.8 m off with a sigma of 1.8 m, and 39 of 100 frames were inside
+    # their 95 % bound.
     unmatched: float = 0.0  # uncorrected walk of east and north, m per root m, times (1 - quality)
 
 

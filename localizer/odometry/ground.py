@@ -109,10 +109,11 @@ class RangefinderGround:
 def height_above_ground(
     points_world: Array, covariance: Array, place: Array
 ) -> tuple[float, float]:
-    """Mean and sigma (m) of a camera's height at `place` (3,) above ground points (N, 3).
+    """Mean and sigma (m) of a camera's height above ground points (N, 3), world axes; the mean is
+    at least 1 m.
 
-    covariance: (3, 3) of the place. Around it the ground is assumed to continue with the slope of
-    the visible ground.
+    place: (3,) the camera's position, covariance: its (3, 3). Around it the ground is assumed to
+    continue with the slope of the visible ground.
     """
     centred = points_world - points_world.mean(axis=0)
     slope = np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)[0]

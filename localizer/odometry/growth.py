@@ -76,7 +76,8 @@ def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tu
 
 
 def kalman_update(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
-    """The pose after an independent measurement of single axes: a Kalman update.
+    """The pose and its covariance (6, 6) after an independent measurement of single axes (those
+    with information in `constraint`): a Kalman update.
 
     Correlated axes are corrected, too: a better rotation also corrects the position. covariance:
     (6, 6) of the pose before.
@@ -100,8 +101,8 @@ def between(
 ) -> PoseConstraint | None:
     """Constraint on a later pose from the change between two sensor constraints.
 
-    pose: at `then`, taken as exact. turn_sigma: (3,) rad, rise_sigma: m, of the change. None if
-    both constraints have no component in common.
+    then, now: the sensors at both times; pose: at `then`, taken as exact. turn_sigma: (3,) rad,
+    rise_sigma: m, of the change. None if both constraints have no component in common.
     """
     information, rotation, height = np.zeros(6), pose.rotation, pose.translation[2]
     if _knows_rotation(then) and _knows_rotation(now):

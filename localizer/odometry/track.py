@@ -70,7 +70,9 @@ class OdometryTrack:
     def predict(
         self, config: OdometryConfig, time_ns: int, constraint: PoseConstraint | None
     ) -> PosePrior:
-        """Predict the pose: constant velocity, with the sensors' rotation (None: the last one)."""
+        """The predicted pose at time_ns, with its covariance: constant velocity, and the change of
+        the sensors' rotation since the last frame (None: the last rotation).
+        """
         dt = seconds(self.time_ns, time_ns)
         rotation, aided = self.pose.rotation, aided_rotation(constraint)
         if aided is not None and self.aided_rotation is not None:

@@ -46,7 +46,8 @@ def select_anchors(
 
 
 def anchors_at(points_world: Array, pixels: Array, features: FeaturePyramid) -> Anchors:
-    """Anchors of known surface points (N, 3) that the image shows at pixels (N, 2).
+    """Anchors of known surface points (N, 3), world metres, that the image shows at pixels (N, 2),
+    with the features sampled there.
 
     They come in Morton order, see `select_anchors`.
     """

@@ -257,7 +257,8 @@ def image_gap_px(differences: Array, rotation: Array, translation: Array, motion
 def mode_spread(differences: Array, probabilities: Array) -> Array:
     """(6, 6) second moment of competing modes about the chosen pose (equation 14).
 
-    differences: (M, 6) of the modes to the chosen pose.
+    differences: (M, 6) of the modes to the chosen pose, as `pose_differences` returns them;
+    probabilities: (M,) of the modes.
     """
     spread: Array = np.einsum("m,mi,mj->ij", probabilities, differences, differences)
     return spread

@@ -29,7 +29,8 @@ class PoseConstraint:
 def attitude_constraint(
     rotation: Array, tilt_sigma_rad: float, heading_sigma_rad: float
 ) -> PoseConstraint:
-    """The camera's rotation (3, 3) world_from_camera from the autopilot and the gimbal.
+    """A constraint on the camera's rotation (3, 3) world_from_camera, measured by autopilot and
+    gimbal.
 
     tilt_sigma_rad: of roll and pitch, small because of gravity; heading_sigma_rad: about the
     vertical, large because of the compass.

@@ -82,8 +82,8 @@ def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float3
 
 
 def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:
-    """1 - score / chance score, 0 to 1, at a pose camera_from_local; chance pairs each anchor with
-    another one's query feature.
+    """Registration quality, 0 to 1, at a pose camera_from_local (R (3, 3), t (3,)): 1 - cost /
+    chance cost. For the chance cost each anchor is compared with another anchor's query feature.
     """
     query, reference, weights = _sampled(problem, R, t)
     others = np.roll(reference, len(reference) // 2, axis=0)
@@ -93,7 +93,9 @@ def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> 
 
 
 def median_residual(problem: LevelProblem, R: Array, t: Array) -> float:
-    """Weighted median of the residual norms at a pose camera_from_local with anchors in view."""
+    """Weighted median of the residual norms of the anchors in view at a pose camera_from_local (R
+    (3, 3), t (3,)). At least one anchor must be in view.
+    """
     query, reference, weights = _sampled(problem, R, t)
     norms = np.linalg.norm(query - reference, axis=1)
     order = np.argsort(norms)

@@ -99,7 +99,9 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> Relocalization | None:
-        """The candidate that registration confirms; None if it confirms none, or if cancelled."""
+        """Register the query at the candidates, and return the position that is clearly better than
+        all others; None if there is none, or if should_stop() became true.
+        """
         began = time.perf_counter()
         registered = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}

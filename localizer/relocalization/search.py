@@ -95,8 +95,8 @@ def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel
 
 
 def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
-    """Ground heights that a camera in the query's region can see, any shape; the whole map's
-    without a region.
+    """Ground heights (world z, m; NaN: unknown) of the level's grid cells that a camera in the
+    query's region can see; of the whole map without a region.
     """
     if query.region is None or not np.isfinite(level.ground).any():
         return level.ground

@@ -101,7 +101,9 @@ class Verifier:
     seed: int
 
     def prior(self, candidate: PlaceCandidate, query: PlaceQuery) -> PosePrior:
-        """The candidate's pose with its covariance."""
+        """The candidate's pose world_from_camera as a prior of the query's frame. Its covariance is
+        that of the search in position and heading, and that of the query in tilt and height.
+        """
         tilt = max(query.tilt_sigma_rad, _LEAST_TILT_SIGMA_RAD)
         rise = max(query.height_sigma_m, 1.0)
         sigma = np.array(

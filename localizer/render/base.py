@@ -164,7 +164,9 @@ def bounding_spheres(meshes: Sequence[TileMesh]) -> tuple[Array, Array]:
 def are_visible(
     centres: Array, radii: Array, world_from_camera: Pose, camera: Camera
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the spheres (see `bounding_spheres`) that are in view."""
+    """Mask (N,) of the spheres (see `bounding_spheres`) that are in view. centres: (N, 3) world,
+    radii: (N,), both m.
+    """
     x, y, z = world_from_camera.inverse.apply(centres).T
     seen = z >= NEAR_M - radii
     for offset, focal, near_edge, far_edge in (

@@ -146,7 +146,9 @@ class ModernGLRenderer(TileRenderer):
         return RenderedView(rgb, depth, world_from_camera, camera)
 
     def close(self) -> None:
-        """Release the context."""
+        """Release the OpenGL context and all uploaded meshes. Only the thread that made the
+        renderer may call this.
+        """
         self._assert_owner()
         for item in self._uploaded.values():
             item.release()

@@ -64,7 +64,7 @@ class NumbaRenderer(TileRenderer):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """Draw exactly these meshes."""
+        """See `TileRenderer.draw`."""
         meshes = _front_to_back([m for m in meshes if len(m.faces)], world_from_camera)
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.float32)

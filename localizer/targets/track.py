@@ -199,8 +199,9 @@ class TargetTrack:
         return replace(fix, pixel=pixel, visibility=seen)
 
     def is_being_hidden(self, estimate: PoseEstimate, position: Array) -> bool:
-        """Whether the map hides a moving target at `position` (3,) now or within half a second:
-        half hidden, observations of it are biased to its visible side.
+        """Whether the map hides a moving target at `position` (3,), world, now or within half a
+        second. A target that is half hidden is seen at its visible side, so its observations are
+        biased.
         """
         velocity = self._moving.velocity
         ahead = position if velocity is None else position + _ENTERS_S * velocity

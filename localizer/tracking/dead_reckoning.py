@@ -119,10 +119,13 @@ class DeadReckoning:
         self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None,
         sweep: Sweep | None = None,
     ) -> PropagatedPose:  # fmt: skip
-        """Propagate the pose to a frame with features `query`; NONE without a start pose.
-        prediction: the motion model's; anchors: of the reference at the prediction, None without
-        one, as beyond the map's edge; sweep: as `begin`. BROKEN drops the start pose: NONE follows
-        until `begin`.
+        """Propagate the pose to a frame with features `query`.
+
+        prediction: of the motion model, for this frame; anchors: of the reference view at the
+        prediction, None without one, for example beyond the map's edge; sweep: as `begin`. Result:
+        CARRIED with the pose; GAP if this frame is not usable; BROKEN if the odometry has failed or
+        its sigma is too large: then the start pose is dropped, and NONE follows until the next
+        `begin`.
         """
         if not self._odometry.ready:
             return _NOTHING

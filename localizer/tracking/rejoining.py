@@ -44,8 +44,10 @@ class Rejoining:
         self, pose: Pose, covariance: Array, time_ns: int, carried: Pose, rotation: Array | None,
         config: IntegrityConfig,
     ) -> Rejoining:  # fmt: skip
-        """Add a rejected registration of good quality, covariance (6, 6). carried: the propagated
-        pose at its time. rotation: the camera's, by the autopilot; None: unknown.
+        """Add a rejected registration of good quality, covariance (6, 6), exposure time_ns; returns
+        the next state. carried: the propagated pose at this time. rotation: (3, 3)
+        world_from_camera by the autopilot; None: unknown. A registration that contradicts the
+        series starts a new one.
         """
         first = Rejoining(TentativeTrack(pose, covariance, time_ns), carried.translation, 1)
         if self.begun is None or self.carried is None:

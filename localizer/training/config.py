@@ -151,7 +151,9 @@ class TrainConfig(_Frozen):
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read a YAML file; unknown keys and bad values raise `ModelError` with their names."""
+    """Read a training configuration from a YAML file. `ModelError` names the file, and unknown keys
+    or bad values.
+    """
     try:
         data = load_yaml(plain_text(path))
         config = TrainConfig.model_validate(data)

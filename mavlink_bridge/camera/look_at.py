@@ -74,7 +74,9 @@ class LookAt:
                 self._wanted = self._place_of(target)
 
     def forget(self, number: int) -> None:
-        """A target ended: a gimbal that follows it keeps its direction, which is reported."""
+        """Forget a target that has ended. If the gimbal follows this target, it keeps its
+        direction, and that is reported.
+        """
         with self._lock:
             self._targets.pop(number, None)
             if self._number != number:

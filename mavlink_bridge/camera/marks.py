@@ -36,8 +36,9 @@ class Marks:
         return len(self._marks)
 
     def due(self, targets: Mapping[int, TargetReport], now_ns: int) -> TargetMark | None:
-        """The marker to send now, noted as sent; one at a time, because a slow port must carry
-        positions.
+        """The target marker to send at now_ns, or None; the marker counts as sent. A marker is made
+        once a target's sigma is small enough, and is sent three times. At most one is returned, so
+        that a slow port still carries the positions.
         """
         for number, report in targets.items():
             if number not in self._marks and is_confirmed(report, self._sigma_m):

@@ -51,7 +51,9 @@ class PositionCommand:
         self._held_ns = self._held_since_ns = 0  # fixes that were not sent
 
     def add_answer(self, result: int, now_ns: int) -> None:
-        """Process the MAV_RESULT of a sent command."""
+        """Process the autopilot's MAV_RESULT to a sent command. The first answer decides whether
+        the firmware fuses this command.
+        """
         self.answer = CommandAnswer.of(result)
         is_accepted = result == mavlink.MAV_RESULT_ACCEPTED
         if self._fuses is None:

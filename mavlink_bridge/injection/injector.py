@@ -201,7 +201,10 @@ class Injector:
         self._fresh = None
 
     def step(self, now_ns: int, context: InjectionContext) -> EncodedMessage | None:
-        """The message to send at now_ns, or None; `reason` says why nothing was sent."""
+        """The message to send at now_ns (CLOCK_MONOTONIC), or None. Takes the fixes whose age has
+        reached the delay, tests their yaw, and updates the counters. `reason`: the alert that
+        explains why a due position was not sent, None if it was.
+        """
         self._take_due(now_ns, context)
         outcome = self._next(now_ns, context)
         if outcome is None:

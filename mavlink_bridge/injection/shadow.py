@@ -82,7 +82,10 @@ class ShadowScorer:
         self._samples: deque[tuple[int, float, float, float, float]] = deque(maxlen=_LENGTH)
 
     def compare(self, fix: PropagatedFix, reference: tuple[float, ...]) -> None:
-        """Add a fix and the autopilot's (latitude, longitude, altitude AMSL) at its time."""
+        """Add a fix and the autopilot's position at the fix's time to the samples of the shadow
+        check. reference: latitude, longitude (degrees), altitude above mean sea level (m).
+        Thread-safe.
+        """
         difference = np.array(
             north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
         )

@@ -174,7 +174,10 @@ class BootClock:
         return bool(self._behind) or bool(self._ahead)
 
     def observe(self, boot_ns: int, received_ns: int) -> bool:
-        """Process a message's boot time, ns. True, and all else is forgotten, after a reboot."""
+        """Process a message: its boot time and the time of its reception (CLOCK_MONOTONIC), both
+        ns. Returns True if the message shows that the autopilot has rebooted; all earlier
+        observations are then discarded. Messages that are late or ahead of the clock are ignored.
+        """
         rebooted = self._ran_back(boot_ns, received_ns)
         if self._behind:
             return False  # an old frame that came late, or the first ones after a reboot

@@ -53,7 +53,10 @@ class VerifyingMavlink(mavlink.MAVLink):
     window: ReplayWindow | None = None
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Whether our key signed the frame, after its stream's last one, which it now becomes."""
+        """Whether the frame is signed with our key and newer than the last accepted frame of its
+        stream (link id, system, component). An accepted frame's timestamp is stored, so that the
+        frame cannot be replayed.
+        """
         digest = hashlib.sha256(self.signing.secret_key + bytes(msgbuf[:-6])).digest()[:6]
         if digest != bytes(msgbuf[-6:]):
             return False

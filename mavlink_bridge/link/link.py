@@ -202,7 +202,9 @@ class Link:
         return True
 
     def stats(self) -> dict[str, int]:
-        """Counters of link and framing."""
+        """Counters of the link and of its framing since the start, by name. `rx_of_strangers`:
+        datagrams of other senders.
+        """
         transport = self._transport
         refused = transport.refused if isinstance(transport, UdpTransport) else 0
         mine = {**asdict(self.counters), "rx_of_strangers": refused}

@@ -51,7 +51,9 @@ class ReplayWindow:
             return max(self._leases.values(), default=0)
 
     def add_accepted(self, stream: Stream, stamp: int) -> None:
-        """Store the timestamp of an accepted frame; never blocks on the disk."""
+        """Note the timestamp (10 µs) of an accepted frame. Another thread writes it to disk, so
+        this call never blocks.
+        """
         with self._lock:
             if stamp + _LEASE // 2 <= self._leases.get(stream, 0):
                 return

@@ -68,7 +68,9 @@ def signing_timestamp(unix_time_s: float | None = None) -> int:
 
 
 def enable(mav: Any, key: bytes, link_id: int) -> None:
-    """Make a pymavlink `MAVLink` sign what it sends and reject frames not signed with `key`."""
+    """Make a pymavlink `MAVLink` sign what it sends with `key` (32 bytes) and this link id, and
+    reject frames that are unsigned or not signed with the key.
+    """
     mav.signing.secret_key = key
     mav.signing.link_id = link_id
     mav.signing.timestamp = signing_timestamp()

@@ -111,7 +111,10 @@ class VehicleClient:
                 self._changed.notify_all()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Send a heartbeat, so that the autopilot answers on this link."""
+        """Send a heartbeat once a second, so that the autopilot answers on this link; returns the
+        time of the next call, ns. On a link on which the autopilot speaks second, or that is
+        signed, a system id is guessed until it has been heard.
+        """
         if link.system_id == 0 and (link.endpoint.kind == "udpout" or self.config.signing):
             link.system_id = _FIRST_GUESS
         if link.system_id and now_ns >= self._next_heartbeat_ns:

@@ -244,7 +244,9 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Docto
 
 
 def check_computer_clock(config: BridgeConfig) -> list[DoctorFinding]:
-    """Check that this computer's clock is set; [] if neither GPS_INPUT nor signing needs it."""
+    """A finding on whether this computer's clock (UTC) is set; [] if neither GPS_INPUT nor signing
+    is configured, which need it.
+    """
     if config.injection.message != "gps_input" and not (config.signing or config.ground_signing):
         return []
     utc = SteadyUtc()

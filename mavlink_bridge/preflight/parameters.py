@@ -37,7 +37,7 @@ def decode_value(value: float, kind: int, *, bytewise: bool) -> float:
 
 
 def encode_value(value: float, kind: int, *, bytewise: bool) -> float:
-    """Inverse of `decode_value`."""
+    """The float to send in PARAM_SET for a parameter's value: the inverse of `decode_value`."""
     if bytewise and kind in _INTEGER_FORMATS:
         raw = struct.pack(_INTEGER_FORMATS[kind], round(value))
         return float(struct.unpack("<f", raw)[0])
@@ -52,7 +52,9 @@ class ParameterClient(VehicleClient):
         self._values: dict[str, tuple[float, int]] = {}
 
     def read(self, name: str) -> float | None:
-        """The parameter's value; None if it does not exist, or no answer comes in 2 s."""
+        """Request a parameter from the vehicle, and return its value; None if it does not exist, or
+        no answer comes in 2 s.
+        """
         self._values.pop(name, None)
         request = mavlink.MAVLink_param_request_read_message(
             self.system, self.component, name.encode("ascii"), -1

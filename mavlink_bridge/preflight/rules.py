@@ -100,7 +100,9 @@ def find_source_set(config: BridgeConfig, read: Read) -> int:
 
 
 def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[ParameterRule]:
-    """Rules for ArduPilot with the configured injection in a source set."""
+    """The values that ArduPilot's parameters must have for the configured injection. source_set:
+    number of the EKF's source set that uses vision.
+    """
     common = [
         ParameterRule(("AHRS_EKF_TYPE",), (3.0,), "only EKF3 has external navigation sources"),
         ParameterRule(

@@ -18,7 +18,9 @@ class Commander:
         self._component = component
 
     def send(self, link: Link, command: int, *parameters: float) -> None:
-        """Send COMMAND_LONG (76), once; parameters 1 to 7, missing ones are 0. Awaits no answer."""
+        """Send COMMAND_LONG (76) to the autopilot once; parameters 1 to 7, missing ones are 0. Does
+        not wait for the answer.
+        """
         padded = [*parameters, *([0.0] * (_PARAMETERS - len(parameters)))]
         message = mavlink.MAVLink_command_long_message(
             link.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded
@@ -26,7 +28,9 @@ class Commander:
         link.send(message, self._component)
 
     def send_int(self, link: Link, command: int, frame: int, place: tuple[int, int, float]) -> None:
-        """Send COMMAND_INT (75) likewise. place: latitude, longitude (1e-7 deg), altitude (m)."""
+        """Send COMMAND_INT (75) to the autopilot once, with parameters 1 to 4 zero; does not wait
+        for the answer. frame: MAV_FRAME; place: latitude, longitude (1e-7 deg), altitude (m).
+        """
         message = mavlink.MAVLink_command_int_message(
             link.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, frame, command, 0, 0, 0, 0, 0, 0, *place
         )

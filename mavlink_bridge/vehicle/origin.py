@@ -74,7 +74,9 @@ def north_east(
 def offset(
     origin_lat: float, origin_lon: float, north_m: float, east_m: float
 ) -> tuple[float, float]:
-    """(latitude, longitude), degrees, at an offset; inverse of ArduPilot's `north_east`."""
+    """(latitude, longitude) in degrees of the point north_m and east_m from an origin (degrees);
+    the inverse of ArduPilot's `north_east`.
+    """
     latitude = origin_lat + north_m / METRES_PER_DEGREE
     scale = _longitude_scale((origin_lat + latitude) / 2.0)
     return latitude, wrap_degrees(origin_lon + east_m / (METRES_PER_DEGREE * scale))

@@ -47,7 +47,10 @@ class TimeSync:
         self._sent.clear()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> bool:
-        """Process a request or an answer; True if the vehicle's clock shows a reboot."""
+        """Process a TIMESYNC received at time_ns: answer a request (unless the link is congested),
+        or use the answer to our own request for the clock offset. True if an answer shows that the
+        autopilot has rebooted.
+        """
         if message.tc1 == 0:
             if link.congested:
                 return False  # as if lost: a flood of questions costs no position its place

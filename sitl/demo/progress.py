@@ -32,7 +32,9 @@ class LogProgress:
 
 @contextmanager
 def shown_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """Context manager: a progress callback (phase, share done) that prints to `console`."""
+    """Context manager: yields a callback (phase, share done from 0 to 1) that shows progress on
+    `console`: a bar in a terminal, otherwise lines.
+    """
     if not console.is_terminal:
         yield LogProgress(console)
         return

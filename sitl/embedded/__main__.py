@@ -46,7 +46,9 @@ def _stop(_signal: int, _frame: FrameType | None) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the vehicle; returns the exit status."""
+    """Run the embedded vehicle until interrupted; a reboot starts it anew. Returns the exit status,
+    1 after a `VehicleError`.
+    """
     arguments = _arguments(argv)
     home, heading_deg = arguments.home
     try:

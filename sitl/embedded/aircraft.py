@@ -143,7 +143,9 @@ class Aircraft:
         return wind
 
     def sense(self) -> None:
-        """Read the sensors that are due and pass the measurements to the EKF."""
+        """Read the sensors that are due at this tick, and pass their measurements to the EKF. The
+        first tick also aligns the EKF's attitude.
+        """
         now = self.time_ms
         if self.tick == 1:
             self.estimator.align(self.sensors.compass(self.truth))

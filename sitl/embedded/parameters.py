@@ -129,7 +129,9 @@ class Parameters:
         return name in self._values
 
     def set(self, name: str, value: float) -> bool:
-        """Set a known parameter, rounded if it is an integer; False if it is not known."""
+        """Set a parameter, rounded if it is an integer. Returns False, and changes nothing, if the
+        vehicle has no parameter of this name.
+        """
         if name not in self._values:
             return False
         self._values[name] = value if self.type_of(name) == REAL32 else float(round(value))

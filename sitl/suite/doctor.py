@@ -22,11 +22,11 @@ class DoctorError(SimulationError):
 
 
 def run_doctor(config: BridgeConfig) -> Doctor:
-    """Run the doctor, `companion doctor --fix --yes`, which writes the vehicle's parameters, and
-    the doctor again. `DoctorError` if nothing was written.
+    """Run the doctor, then `companion doctor --fix --yes`, which writes the vehicle's parameters,
+    then the doctor again; returns what both runs found. `DoctorError` if nothing was written.
 
-    The exit codes are those of the flight controller's checks, because a suite has neither map nor
-    camera, which `companion doctor` would report as missing.
+    The exit codes are those of the flight controller's checks only, because a suite has neither map
+    nor camera, which `companion doctor` would report as missing.
     """
     before = examine(config)
     found = tuple(f.name for f in before.findings if not f.ok and f.fix is not None)

@@ -83,7 +83,7 @@ class ReportRow:
 
 
 def figures(errors: Array) -> Figures | None:
-    """Median, 95th percentile and maximum; None for an empty array."""
+    """Median, 95th percentile and maximum of errors (N,), m; None for an empty array."""
     if not len(errors):
         return None
     median, p95, largest = (float(v) for v in (*np.percentile(errors, [50, 95]), errors.max()))
@@ -96,7 +96,9 @@ def evaluate(case: Case, record: CaseRecord) -> tuple[ExpectationResult, ...]:
 
 
 def run_case(case: Case, kind: VehicleKind, seed: int) -> ReportRow:
-    """Fly and evaluate one scenario; an error becomes the row's error."""
+    """Fly and evaluate one scenario on one kind of vehicle. If the flight fails, the row holds the
+    error's text; nothing is raised.
+    """
     start = time.monotonic()
     try:
         record = fly(case, kind, seed)

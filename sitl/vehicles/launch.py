@@ -63,7 +63,10 @@ def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[
 
 
 def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
-    """Parameters of a vehicle without a GNSS receiver; its EKF origin must be sent."""
+    """ArduPilot parameters of a vehicle without a GNSS receiver that navigates on vision. The EKF
+    has no position until an origin is sent. sigma_m: noise of the positions, 1 sigma; delay_ms:
+    their age.
+    """
     return {
         "GPS1_TYPE": 0,
         "VISO_TYPE": 1,

@@ -109,7 +109,7 @@ class TileMesh:
         return int(own + sum(m.nbytes for m in self.mips))
 
     def placed(self, world_from_tile: Pose) -> TileMesh:
-        """The same mesh at another pose; arrays are shared."""
+        """The same mesh, with its arrays shared, at the pose world_from_tile."""
         return TileMesh.from_packed(
             self.positions,
             self.uvs,

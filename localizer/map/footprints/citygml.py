@@ -36,7 +36,10 @@ _ADV = re.compile(r"ETRS89_UTM(\d\d)")  # Germany's surveys
 
 
 def read_citygml(path: Path) -> Footprints:
-    """Buildings with measuredHeight or else their solids' height, or `MapSourceError`."""
+    """Read the buildings of a CityGML file with their heights in metres: measuredHeight, otherwise
+    the height of their solids. Buildings without a height are counted in `left_out`.
+    `MapSourceError` if the file cannot be read or holds no usable building.
+    """
     try:
         data = plain_bytes(path, MOST_BYTES)
         if b"<!ENTITY" in data or b"<!DOCTYPE" in data:

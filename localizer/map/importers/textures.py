@@ -96,7 +96,9 @@ def transform_mesh(mesh: SourceMesh, T: Array) -> SourceMesh:
 
 
 def merge_by_image(parts: list[SourceMesh]) -> list[SourceMesh]:
-    """One mesh per image; all flat colours become one palette."""
+    """Merge meshes with the same texture image and wrapping; all flat-coloured meshes become one
+    mesh with a palette.
+    """
     groups: dict[tuple[int, bool], list[SourceMesh]] = {}
     palettes = [p for p in parts if p.palette]
     for part in parts:

@@ -66,14 +66,18 @@ class ContentFile:
         return gltf_weight(self._gltf()[0], self._beside, self.rules)
 
     def load(self) -> list[SourceMesh]:
-        """Meshes with positions in ECEF metres (float64)."""
+        """Read the file's meshes; positions in ECEF metres (float64). `MapSourceError` if the file
+        is malformed or exceeds a limit.
+        """
         data, rtc = self._gltf()
         meshes, gltf_rtc = read_gltf(data, self._beside, self.rules)
         T = self._ecef_from_gltf(rtc + gltf_rtc)
         return [transform_mesh(m, T) for m in meshes]
 
     def corners(self) -> Array:
-        """(N, 3) ECEF corners of boxes that hold the content, by the file's headers."""
+        """(N, 3) ECEF corners, m, of boxes that hold the content, by the file's headers where they
+        state them. `MapSourceError` if the file is malformed.
+        """
         data, rtc = self._gltf()
         corners, gltf_rtc = gltf_bounds(data, self._beside, self.rules)
         T = self._ecef_from_gltf(rtc + gltf_rtc)

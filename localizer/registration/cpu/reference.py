@@ -51,7 +51,9 @@ def project(problem: LevelProblem, rotation: Array, translation: Array) -> tuple
 
 
 def in_view(problem: LevelProblem, x: Array, uv: Array) -> NDArray[np.bool_]:
-    """Which anchors (N,) lie before the camera and between four feature cells."""
+    """Which anchors (N,) lie in front of the camera and between four feature cells. x: (N, 3) in
+    the camera frame; uv: (N, 2) array index coordinates, as `project` returns them.
+    """
     h, w = problem.confidence.shape
     u, v = uv.T
     inside: NDArray[np.bool_] = (u >= 0) & (u < w - 1) & (v >= 0) & (v < h - 1)
@@ -64,7 +66,9 @@ def count_in_view(problem: LevelProblem, rotation: Array, translation: Array) ->
 
 
 def feature_gradients(features: Float32, u: Array, v: Array) -> tuple[Array, Array]:
-    """Derivatives (N, C), along x and y, of the bilinear interpolation at indices u, v (N,)."""
+    """Derivatives (N, C), along x and y, of the bilinear interpolation of features (h, w, C) at
+    array index coordinates u, v (N,).
+    """
     h, w = features.shape[:2]
     x0 = np.clip(np.floor(u).astype(np.int64), 0, w - 2)
     y0 = np.clip(np.floor(v).astype(np.int64), 0, h - 2)
@@ -77,7 +81,9 @@ def feature_gradients(features: Float32, u: Array, v: Array) -> tuple[Array, Arr
 
 
 def projection_jacobian(problem: LevelProblem, x: Array, translation: Array) -> Array:
-    """d(u, v) / d(rho, phi), (N, 2, 6): equation 6, rotation about the local origin."""
+    """d(u, v) / d(rho, phi), (N, 2, 6): equation 6, rotation about the local origin. x: (N, 3)
+    anchors in the camera frame; translation: (3,) of camera_from_local.
+    """
     fx, fy = problem.focal
     z = np.maximum(x[:, 2], MIN_DEPTH)
     a, b, c, d = fx / z, -fx * x[:, 0] / z**2, fy / z, -fy * x[:, 1] / z**2
@@ -174,7 +180,10 @@ def retractions(rotation: Array, translation: Array, steps: Array) -> tuple[Arra
 def damped_step(
     hessian: Array, gradient: Array, translation: Array, damping: float
 ) -> Array | None:
-    """Solution (6,) of the damped normal equations (8), None where they are singular."""
+    """Solution (6,) of the damped normal equations (8): the update (rho, phi). None if they are
+    singular. hessian: (6, 6), gradient: (6,), translation: (3,) of camera_from_local, damping:
+    lambda.
+    """
     if not np.all(np.diag(hessian) > 0):
         return None
     about_camera = np.eye(6)  # of equation 8a: updates about the camera's centre

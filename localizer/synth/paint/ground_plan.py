@@ -93,7 +93,7 @@ class GroundPlan:
         )
 
     def regions(self) -> Regions:
-        """The finished tables."""
+        """The properties of all regions so far, as arrays by region number."""
         return Regions(
             np.array(self._material, np.uint8),
             np.array(self._tint, np.float32),

@@ -28,7 +28,9 @@ def plan_field(
     planner: Planner, rng: np.random.Generator, i: int, j: int,
     fields: dict[tuple[int, int, int], int],
 ) -> None:  # fmt: skip
-    """Strips of crops that continue in neighbouring cells. fields: their regions, updated."""
+    """Fill the cell (column i, row j) with strips of crops that continue in neighbouring cells.
+    fields: the regions drawn so far by (i // 2, j // 2, strip), updated.
+    """
     lattice = planner.net.lattice
     group = planner.config.rng(30, i // 2 + 500, j // 2 + 500)
     strips = int(group.integers(1, 4))
@@ -55,7 +57,9 @@ def plan_field(
 
 
 def hedgerow(planner: Planner, rng: np.random.Generator, i: int, j: int) -> None:
-    """Shrubs and trees along a side of a country cell that has no street."""
+    """Plant shrubs and trees along the side of a cell from node (i, j) to (i + 1, j), if no street
+    runs there; not on every such side.
+    """
     if planner.net.side((i, j), (i + 1, j)) is not None or rng.random() < 0.6:
         return
     line = resample(planner.net.lattice.line((i, j), (i + 1, j)), 3.2)
@@ -101,7 +105,9 @@ def plan_orchard(
 
 
 def plan_farm(planner: Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
-    """A farmyard with its buildings beside a street."""
+    """Place a farmyard with its buildings in the cell (column i, row j), and a lane to a street if
+    the cell has one. outline: (N, 2) of the cell, ENU metres.
+    """
     angle, middle = main_axis(outline) + rng.normal(0, 0.2), outline.mean(0)
     yard = planner.ground.region(Material.CONCRETE, angle=angle, vary=0.1)
     planner.ground.polygon(LAYER_PLOT, rectangle(middle, angle, 42, 34), yard)

@@ -58,7 +58,9 @@ class Occupancy:
         return True
 
     def is_free(self, xy: Array, radius: float) -> NDArray[np.bool_]:
-        """Which points (N, 2) have nothing within about `radius`, and lie inside the world."""
+        """Which points (N, 2), ENU metres, have nothing within about `radius` metres, and lie
+        inside the world: (N,).
+        """
         n = self.grid.shape[0]
         uv = self._pixels((xy[:, None] + radius * CROSS).reshape(-1, 2))
         inside = (uv >= 0) & (uv < n)
@@ -88,7 +90,10 @@ class Planner:
         self, rng: np.random.Generator, kind: Kind, centre: ArrayLike, angle: float, length: float,
         width: float, eaves: float, margin: float = 1.5,
     ) -> Building | None:  # fmt: skip
-        """Add a building if it, with `margin` (m), is on free ground in the world; else None."""
+        """Add a building if it, with `margin` around it, is on free ground in the world; otherwise
+        return None. centre: ENU; angle: of its length from east, rad; all lengths in metres. Its
+        ground is then occupied.
+        """
         c = np.asarray(centre, float)
         polygon = rectangle(c, angle, length, width)
         if np.abs(polygon).max() > self.config.half_m - 4.0:
@@ -142,7 +147,9 @@ class Planner:
 
 
 def frontages(planner: Planner, i: int, j: int) -> list[tuple[Array, Street]]:
-    """The sides of a cell that face a street: line (N, 2) at 1 m with the cell on its left."""
+    """The sides of the cell (column i, row j) that face a street: points (N, 2) 1 m apart, ENU,
+    with the cell on their left, and the street.
+    """
     corners = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1), (i, j)]
     found = []
     for a, b in pairwise(corners):

@@ -56,14 +56,14 @@ class Lattice:
     waves: Array  # (K, 5): wave vector x, y, phase, amplitude x, y
 
     def warp(self, uv: Array) -> Array:
-        """Lattice coordinates (..., 2) to ENU (..., 2)."""
+        """Convert lattice coordinates (..., 2) to ENU metres (..., 2)."""
         c, s = np.cos(self.angle), np.sin(self.angle)
         xy = uv @ np.array([[c, s], [-s, c]])
         phase = xy @ self.waves[:, :2].T + self.waves[:, 2]
         return np.asarray(xy + np.sin(phase) @ self.waves[:, 3:])
 
     def line(self, a: tuple[int, int], b: tuple[int, int]) -> Array:
-        """The curved edge between two lattice nodes, (N, 2)."""
+        """The curved edge between two lattice nodes (column, row): (N, 2), ENU metres."""
         p = np.array([self.u[a[0]], self.v[a[1]]])
         q = np.array([self.u[b[0]], self.v[b[1]]])
         t = np.linspace(0, 1, _SUB + 1)[:, None]
@@ -134,7 +134,9 @@ def _main_indices(rng: np.random.Generator, lines: Array, dry: list[bool]) -> se
 
 def make_streets(config: WorldConfig, terrain: Terrain, urban: dict[tuple[int, int], bool],
                  lattice: Lattice) -> StreetNet:  # fmt: skip
-    """Choose which lattice edges become streets; the result is one connected net."""
+    """Choose which lattice edges become streets, so that all streets form one connected net. urban:
+    for each cell (column, row), whether it is built up.
+    """
     rng = config.rng(11)
     nu, nv = len(lattice.u), len(lattice.v)
     limit = config.half_m + 60.0
@@ -218,7 +220,7 @@ def _long_line(lattice: Lattice, i: int | None, j: int | None) -> Array:
 
 
 def offset_line(points: Array, offset_m: float) -> Array:
-    """A line (N, 2) moved sideways, positive to the left of its direction."""
+    """A line (N, 2), metres, moved sideways by offset_m, positive to the left of its direction."""
     tangent = np.gradient(points, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)
@@ -226,7 +228,9 @@ def offset_line(points: Array, offset_m: float) -> Array:
 
 
 def resample(points: Array, step_m: float) -> Array:
-    """Points (N, 2) or (N, 3) at equal steps along a line, ends included."""
+    """Points (N, 2) or (N, 3) at equal steps along a line, metres. Both ends are included, so steps
+    are at most step_m.
+    """
     s = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     n = max(2, int(np.ceil(s[-1] / step_m)) + 1)
     at = np.linspace(0, s[-1], n)

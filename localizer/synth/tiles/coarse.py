@@ -13,7 +13,9 @@ from localizer.synth.tiles.write import TileNode
 
 
 def assemble_top(baker: Baker, column: int, row: int, parts: list[TilePart]) -> TilePart:
-    """Write the 400 m tile over four blocks."""
+    """Write the 400 m tile (column, row from south-west) over its four blocks `parts`; returns its
+    part for the tile above.
+    """
     half = baker.scene.plan.config.half_m
     west, north = column * TOP_M - half, (row + 1) * TOP_M - half
     n = parts[0].ground.shape[0]

@@ -80,7 +80,9 @@ def car_shape() -> PropShape:
 
 
 def car_image(colour: tuple[int, int, int], seed: int, look: VisitLook = SURVEY) -> Image:
-    """Top and side view of a car as one texture, (64, 72, 3), with even light from above."""
+    """Top and side view of a car as one texture, (64, 72, 3) uint8, with even light from above.
+    colour: of the paint, RGB; seed: of the details; look: light of the visit.
+    """
     rng = np.random.default_rng([seed, 5])
     height, width = round(4.0 * _PX_PER_M), round(CAR_LENGTH_M * _PX_PER_M)
     light = np.array(look.sky_rgb) + np.array(look.sun_rgb) * look.sun_direction[2]

@@ -164,7 +164,9 @@ def _document(
 
 
 def write_tileset(path: Path, root: TileNode, ecef_from_enu: Pose, extras: dict[str, Any]) -> None:
-    """Write tileset.json of explicit REPLACE tiles; the root's transform places ENU on Earth."""
+    """Write tileset.json with explicit tiles (refinement REPLACE) below `root`, whose bounds are
+    computed first. ecef_from_enu: places the world on Earth; extras: stored under "asset".
+    """
     root.enclose()
     tile = _tile_json(root, np.zeros(3))
     shift = Pose(np.eye(3), root.origin)

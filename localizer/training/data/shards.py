@@ -58,7 +58,10 @@ def write_shards(
 
 
 def write_world_shards(out: Path, seeds: range, scenes: SceneConfig) -> Iterator[Path]:
-    """Generate, while iterated, all shards of those mesh worlds of which one is not on disk yet."""
+    """Generate the shards of mesh worlds, one world at a time while iterated, and yield their
+    paths. A world whose shards are all on disk is skipped; otherwise all of its shards are written
+    again.
+    """
     # The map's importers (GDAL, pyproj, trimesh) are not needed on a machine that only trains.
     from localizer.training.data.worlds import world_pairs
 

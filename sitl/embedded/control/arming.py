@@ -29,7 +29,9 @@ class ArmingContext:
 
 
 def arming_failures(context: ArmingContext) -> list[str]:
-    """Texts of all checks that fail; empty when the vehicle may arm."""
+    """The texts of all arming checks that fail, as ArduPilot words them; an empty list if the
+    vehicle may arm.
+    """
     failures = _optional(context) + _mandatory(context)
     if not context.mode_armable:
         failures.append(f"{context.mode_name} mode not armable")

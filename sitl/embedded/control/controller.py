@@ -36,9 +36,9 @@ _HEIGHT_P, _CLIMB_P, _CLIMB_I = 1.0, 4.0, 1.0
 def attitude_control(
     q: Array, gyro: Array, target: Array, integrator: Array, dt: float, motors: Array
 ) -> None:
-    """Write motor thrusts (4,) in N to `motors`. q: attitude, body to NED; gyro: rad/s, body axes;
-    target: (5,) attitude quaternion and total thrust in N; integrator: (3,) of the rate loop,
-    updated in place.
+    """Attitude and rate loops: write the four motor thrusts (N) to `motors`. q: attitude, body to
+    NED; gyro: rad/s, body axes; target: (5,) attitude quaternion and total thrust in N; integrator:
+    (3,) of the rate loop, updated in place; dt: seconds.
     """
     # Error quaternion conj(q) * target; its vector part is half the rotation vector.
     w, x, y, z = q[0], -q[1], -q[2], -q[3]
@@ -210,8 +210,8 @@ class PositionController:
     def thrust(
         self, wanted_down: float, velocity_down: float, tilt_cosine: float, dt: float
     ) -> float:
-        """Total thrust (N) from wanted and present down velocity (m/s). tilt_cosine: of the
-        tilt.
+        """Total thrust (N), limited, from wanted and present down velocity (m/s). tilt_cosine:
+        cosine of the vehicle's tilt; dt: seconds. Updates the integral of the climb loop.
         """
         error = wanted_down - velocity_down
         self._integral[2] = min(max(self._integral[2] + _CLIMB_I * error * dt, -3.0), 3.0)

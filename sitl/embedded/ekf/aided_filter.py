@@ -110,7 +110,7 @@ class AidedFilter:
             self._last_yaw_source = yaw
 
     def check_gps(self, gps: GpsData) -> None:
-        """EKF3's receiver checks; the first fix that passes sets a missing origin."""
+        """EKF3's receiver checks of a new fix: sets `gated.gps_fix_good`, and a missing origin."""
         now = self.gated.now_ms
         if not gps.good or now - self.gated.clock.gps_received > 1000:
             self.gated.clock.gps_bad = now

@@ -73,8 +73,9 @@ class GatedFilter:
         sigma: float,
         velocity: tuple[float, float] | None,
     ) -> None:
-        """Fuse north and east (m) if they are inside the gate; after a timeout, reset the position
-        to them instead. velocity: (north, east) m/s for that reset; None: not measured.
+        """Fuse a position (north, east; m from the origin; sigma m) if it is inside the gate; after
+        a timeout, reset the position to it instead. velocity: (north, east) m/s for that reset;
+        None: not measured. Sets `ratios.position` and the time of the last pass.
         """
         p = self.parameters
         innovation = [position[i] - float(self.state[nav.P + i]) for i in range(2)]
@@ -108,8 +109,9 @@ class GatedFilter:
         sigma: float,
         gate_sigma: float,
     ) -> None:
-        """Fuse north, east and (unless None) down velocity, m/s, if inside the gate. sigma: of the
-        measurement; gate_sigma: the sigma that the gate is computed with.
+        """Fuse north, east and (unless None) down velocity, m/s, if it is inside the gate; after a
+        timeout, reset the horizontal velocity to it instead. sigma: of the measurement, gate_sigma:
+        for the gate, both m/s. Sets `ratios.velocity` and the time of the last pass.
         """
         observed = [*horizontal] if vertical is None else [*horizontal, vertical]
         squared, variance = 0.0, 0.0
@@ -131,7 +133,9 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 3 + i, value - self.state[nav.V + i], sigma**2)
 
     def fuse_height(self, height: float, sigma: float) -> None:
-        """Fuse a height above the origin (m) if it is inside the gate."""
+        """Fuse a height above the origin (m, sigma m) if it is inside the gate. Sets
+        `ratios.height`.
+        """
         innovation = -height - float(self.state[nav.P + 2])
         variance = self.cov[8, 8] + sigma**2
         gate = max(0.01 * self.parameters["EK3_HGT_I_GATE"], 1.0) ** 2
@@ -140,7 +144,9 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 8, innovation, sigma**2)
 
     def fuse_yaw(self, yaw_rad: float, sigma: float) -> None:
-        """Fuse a heading (from true north, radians) if it is inside the gate."""
+        """Fuse a heading (radians clockwise from true north, sigma rad) if it is inside the gate.
+        Sets `ratios.yaw`.
+        """
         innovation = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
         variance = self.cov[2, 2] + sigma**2
         gate = max(0.01 * self.parameters["EK3_YAW_I_GATE"], 1.0) ** 2
@@ -149,7 +155,9 @@ class GatedFilter:
             nav.fuse(self.state, self.cov, 2, innovation, sigma**2)
 
     def rotate_to(self, yaw_rad: float, sigma: float) -> None:
-        """Reset the heading (radians) and its variance."""
+        """Reset the heading to yaw_rad (clockwise from true north) with the given sigma (rad). Roll
+        and pitch stay; a requested yaw reset is done.
+        """
         self.yaw_reset = False
         change = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
         rotate_world(self.state[nav.Q : nav.Q + 4], 0.0, 0.0, change)
@@ -172,8 +180,8 @@ class GatedFilter:
         self.clock.velocity_pass = self.now_ms
 
     def update_innovation_status(self) -> None:
-        """Update `innovations_good`: False after 1 s outside the gate, True again after 10 s
-        inside.
+        """Update `innovations_good`: False after 1 s in which position or velocity was outside the
+        gate, True again after 10 s with both inside.
         """
         clock, now = self.clock, self.now_ms
         if self.ratios.position < 1.0 and self.ratios.velocity < 1.0:

@@ -19,7 +19,7 @@ ERROR_SIZE = 15
 
 @njit(cache=True)
 def strapdown(s: Array, imu: Array) -> None:
-    """Propagate the nominal state s through one IMU increment, in place."""
+    """Propagate the nominal state s (16,) through one IMU increment (7,), in place."""
     dt = imu[6]
     R = matrix(s[Q : Q + 4])
     dv = imu[3:6] - s[BA : BA + 3] * dt
@@ -43,7 +43,7 @@ def replay(s: Array, ring: Array, start: int, count: int, out: Array) -> None:
 
 @njit(cache=True)
 def predict(s: Array, cov: Array, imu: Array, noise: Array) -> None:
-    """Propagate state and covariance (15, 15) through one increment, in place.
+    """Propagate state s (16,) and covariance cov (15, 15) through one IMU increment (7,), in place.
 
     noise: (4,) EK3_GYRO_P_NSE, EK3_ACC_P_NSE, EK3_GBIAS_P_NSE, EK3_ABIAS_P_NSE; as in EKF3 each
     enters as (noise * dt)² per step.
@@ -94,7 +94,9 @@ def fuse(s: Array, cov: Array, index: int, innovation: float, variance: float) -
 
 
 def reset_error(cov: Array, start: int, count: int, variance: float) -> None:
-    """Decorrelate `count` error states from `start` on and set their variance, in place."""
+    """Set `count` error states of cov (15, 15) from `start` on to `variance`, uncorrelated with all
+    others, in place.
+    """
     block = slice(start, start + count)
     cov[block, :] = 0.0
     cov[:, block] = 0.0

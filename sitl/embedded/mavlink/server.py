@@ -64,7 +64,9 @@ class SerialPort:
         self._outgoing += raw
 
     def set_interval(self, message_id: int, seconds: float | None) -> None:
-        """Send a message every `seconds` from now on; None stops it."""
+        """Send this message every `seconds` (above 0) of the vehicle's time, from now on; None
+        stops it.
+        """
         if seconds is None:
             self.intervals.pop(message_id, None)
             self.due.pop(message_id, None)
@@ -155,7 +157,9 @@ class MavlinkServer:
             raise
 
     def poll(self) -> Iterator[tuple[SerialPort, Any]]:
-        """Yield (link, message) for the autopilot, after routing."""
+        """Read what the links have received, without waiting. Messages for others are forwarded as
+        ArduPilot does; those for the autopilot are yielded as (link, message).
+        """
         sockets = [link.client or link.listener for link in self.links]
         ready = set(select.select(sockets, [], [], 0.0)[0])
         for link in self.links:

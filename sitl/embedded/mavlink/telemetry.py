@@ -80,7 +80,9 @@ class TelemetryBuilder:
                     link.send(built[message_id])
 
     def send(self, link: SerialPort, message_id: int) -> bool:
-        """Send one message on one link; False if it is not available."""
+        """Build one message from the vehicle's present state and send it on one link; returns
+        False, and sends nothing, if the message is not available.
+        """
         message = self.message(message_id)
         if message is not None:
             link.send(message)

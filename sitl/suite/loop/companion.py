@@ -115,7 +115,9 @@ class LoopCompanion:
                 os.sched_setaffinity(int(thread.name), processors)
 
     def health(self) -> Health:
-        """The newest health report; the defaults of `Health` if there is none."""
+        """The newest health.json of the companion's records, with its age in seconds; the defaults
+        of `Health` if there is none yet or it cannot be read.
+        """
         try:
             reports = self._out.glob("companion*/health.json")
             newest = max(reports, key=lambda path: path.stat().st_mtime)

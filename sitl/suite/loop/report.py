@@ -118,7 +118,9 @@ def _row(flight: dict[str, Any]) -> LoopRow:
 
 
 def markdown(rows: Sequence[LoopRow]) -> str:
-    """Markdown table of the flights, failures first."""
+    """Markdown table of the flights, failed ones first, and below it the rate of false alarms if
+    there were normal flights.
+    """
     ordered = sorted(rows, key=lambda row: (row.ok, row.name, row.vehicle, row.seed))
     lines = ["| " + " | ".join(_COLUMNS) + " |", "|" + "---|" * len(_COLUMNS)]
     lines += ["| " + " | ".join(_cells(row)) + " |" for row in ordered]
