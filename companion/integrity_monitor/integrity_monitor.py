@@ -137,11 +137,13 @@ class IntegrityMonitor:
 
     @property
     def reason(self) -> Alert | None:
-        """Alert that holds the output; None while it is not held."""
+        """Alert that holds the output; None while it is not held. Waits up to 1 s for the lock,
+        without which no fix passes `check` either.
+        """
         if self._is_stalled() or self._failed.raised:
             return self._failed.alert()
         with self._locked() as answers:
-            return self._monitor.reason if answers else None
+            return self._monitor.reason if answers else self._failed.alert()
 
     @property
     def level(self) -> ProtectionLevel | None:

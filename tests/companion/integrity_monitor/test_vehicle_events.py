@@ -332,6 +332,7 @@ def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> 
     integrity_monitor.start()
     try:
         assert stuck.wait(30.0)
+        assert integrity_monitor.reason == FAILED  # no fix passes, so none is kept for a restart
         clock.now_ns += second(2.5)
         assert integrity_monitor.check(FIX) is None
         assert integrity_monitor.reason == FAILED
