@@ -195,7 +195,7 @@ class HealthMonitor:
             return HealthStatus(HealthLevel.FAILED, self._lost(estimate, engine))
         if is_old:
             failed = alert(_error(engine)) if engine.last_error else None
-            news = failed or self._overload(engine) or alert(AlertId.NO_FRAME)
+            news = failed or alert(AlertId.NO_FRAME)
             return HealthStatus(HealthLevel.DEGRADED, (news,))
         return self._tracking(estimate, engine)
 

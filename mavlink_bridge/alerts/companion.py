@@ -59,7 +59,7 @@ HEALTH: tuple[AlertSpec, ...] = (
               "frames are received, but for 2 s none was processed, without an error (not during "
               "`lost`)", WHILE,
               f"{_NO_FIX}; {_HANG}, unless `zoom_unknown` or `zoom_not_in_table` is active; "
-              f"{_REPLACED}, without it `overloaded` may follow",
+              f"{_REPLACED}",
               f"{_TAKE_OVER}; after landing read the log"),
     condition(A.LOCALIZATION_FAILED, WARNING, "localization failed, see the log", {},
               "no frame was processed for 2 s, or none yet, with an error other than "
@@ -68,9 +68,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               {"done": "Hz", "offered": "Hz"},
               "over 5 s fewer than 3 frames/s (the first N) are processed, and 6 or more (the "
               "second) received", WHILE,
-              f"there are too few fixes for the EKF; none if {_HANG} (`no_frame` came before, or "
-              "`rate_hz` in health.json is 0)",
-              f"{_TAKE_OVER}; check the computer's load and temperature; after a hang the log"),
+              "there are too few fixes for the EKF",
+              f"{_TAKE_OVER}; check the computer's load and temperature"),
     condition(A.SEARCH_NOT_READY, WARNING, "search not ready", {},
               "the position is not known (at the start or `lost`), and the map search is being "
               "prepared", WHILE,

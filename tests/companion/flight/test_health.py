@@ -324,6 +324,7 @@ def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, of):
 def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
     """Ten pictures a second come, one is localized; with five a second all is well."""
     now, came = [100.0], [0]
+    monkeypatch.setattr("companion.flight.health._STALE_S", 2.0)
     monkeypatch.setattr("companion.flight.health.time.monotonic", lambda: now[0])
     bridge = FakeBridge(True)
     monitor = HealthMonitor(
@@ -351,6 +352,9 @@ def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
     assert told[-1].alerts[0].id is AlertId.OVERLOADED
     fly(8, 5)
     assert told[-1].alerts == (alert(AlertId.TRACKING),)
+    told.clear()
+    fly(8, 0)  # a hang, which was told as an overload
+    assert [status.alerts[0].id for status in told[2:]] == [AlertId.NO_FRAME] * 6
 
 
 def test_its_first_turn_is_its_start_not_its_making():
