@@ -66,7 +66,9 @@ def read_klv_packets(path: Path) -> list[tuple[int, bytes]]:
 
 
 def read_klv(path: Path) -> KlvTrack:
-    """Telemetry of a video's KLV packets (`read_klv_packets`); no samples if it has none."""
+    """Telemetry of a video's KLV packets, in their order in the file (`read_klv_packets`). Packets
+    without a position give no sample; `packets` includes the damaged ones.
+    """
     samples, damaged, packets, fov = [], 0, 0, None
     for time_ns, body in read_klv_packets(path):
         if body[:4] != tag.UNIVERSAL_LABEL[:4]:

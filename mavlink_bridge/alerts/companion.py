@@ -150,7 +150,9 @@ HEALTH: tuple[AlertSpec, ...] = (
     event(A.MAP_OFFSET, NOTICE, "map {metres:.1f} m {direction} of GNSS{applied}",
           {"metres": "m", "direction": Direction, "applied": MapOffsetUse},
           "the EKF uses GNSS, and for a minute or more vision differed from it by N, over 3.4 "
-          "times the receiver's accuracy and 15 m at most; again if N changes by 2 m",
+          "times the receiver's accuracy (0.5 m at least; 2.5 m if unknown) and 15 m at most; "
+          "again if N changes by 2 m; not with message gps_input; PX4, external_position_estimate: "
+          "not while fixes are sent",
           "map or GNSS is off; *applied* (`bridge.injection.map_shift`): N is subtracted from the "
           "fixes, also after the loss of GNSS; otherwise fixes keep it",
           "check the map's georeference after landing"),
@@ -161,7 +163,7 @@ HEALTH: tuple[AlertSpec, ...] = (
 TARGETS: tuple[AlertSpec, ...] = (
     event(A.TARGET_FOUND, INFO, "target {number}: +-{metres:.1f} m", {"number": "", "metres": "m"},
           "a click's position is found",
-          "a target is made; N: its horizontal sigma (both axes)", NOTHING),
+          "a target is made; N: its horizontal sigma, east and north combined", NOTHING),
     event(A.TARGET_REFUSED, WARNING, "target {number} refused: {why}", _NUMBER_WHY,
           "a click's position cannot be found (WHY, such as no map there, over 5 km away, or known "
           "to over 50 m only)", _NO_TARGET, _CLICK),

@@ -12,7 +12,9 @@ _TAKE_OVER = "take over"
 _DOCTOR = "after landing run `companion doctor`"
 _LANDMARKS = "check landmarks"
 _MAP = "check map and calibration"
-_UNVERIFIED = "not verified yet, and not sent"
+_NOT_FAILED = "the check has not failed: without GNSS injection starts, unverified"
+_WITHIN = "50 or more compared fixes are within the limit; it stays while fewer are compared"
+_FAILED = "the check has failed: injection does not start, also without GNSS"
 _SENT_UNVERIFIED = "unverified fixes are sent"
 _NOT_USED = "the EKF uses no fix"
 _BY: dict[str, Kind] = {"by": (InjectionOrder, RcChannel)}
@@ -41,8 +43,9 @@ INJECTION: tuple[AlertSpec, ...] = (
     condition(A.COMMAND_NOT_TAKEN, WARNING, "command {answer}", {"answer": CommandAnswer},
               "injection is on with message external_position_estimate, and for 2 s the autopilot "
               "has not accepted this command", WHILE,
-              "*not asked, no GNSS*: a test command follows when the EKF uses GNSS; other answers: "
-              "this firmware does not use it, and is not asked again before it reboots",
+              "*not asked, no GNSS*: a test command follows when the EKF uses GNSS; *not "
+              "answered*: another each second; others: this firmware does not use it, and is asked "
+              "again only after a reboot, or each second if it accepted before",
               f"{_TAKE_OVER}; if not asked wait for GNSS, else set another message",
               lead=_NOT_SENT),
     condition(A.EKF_NO_ORIGIN, WARNING, "the EKF has no origin", {},
@@ -79,29 +82,30 @@ INJECTION: tuple[AlertSpec, ...] = (
               "injection does not start", f"act on that alert; {_TAKE_OVER}", lead=_NOT_SENT),
     condition(A.SHADOW_NOT_COMPARED, WARNING, "no fix compared with GNSS", {},
               "no fix of the last 2 min was compared", WHILE,
-              f"{_UNVERIFIED}: no fix, or the EKF does not use GNSS",
+              f"no fix, or the EKF does not use GNSS; {_NOT_FAILED}",
               "wait; check that GNSS has a 3D fix", lead=_NOT_READY),
     condition(A.SHADOW_FEW_FIXES, WARNING, "{fixes:.0f} of {needed:.0f} fixes",
               {"fixes": "fixes", "needed": "fixes"},
-              "fewer than 50 fixes of the last 2 min were compared", WHILE, _UNVERIFIED, "wait",
+              "fewer than 50 fixes of the last 2 min were compared", WHILE, _NOT_FAILED, "wait",
               lead=_NOT_READY),
     condition(A.SHADOW_RATE, WARNING, "fix rate {hertz:.1f} Hz, needs {needed:.0f}",
               {"hertz": "Hz", "needed": "Hz"},
               "fewer than 4 fixes a second were compared, and nothing else fails", WHILE,
-              "there are too few fixes for the EKF", "check the computer's load",
+              f"there are too few fixes for the EKF; {_NOT_FAILED}", "check the computer's load",
               lead=_NOT_READY),
     condition(A.SHADOW_MEDIAN, WARNING, "median error {metres:.1f} m", {"metres": "m"},
-              "the median horizontal difference N is above 3 m", WHILE,
-              "the map may have an offset", _MAP, lead=_NOT_READY),
+              "the median horizontal difference N is above 3 m", _WITHIN,
+              f"the map may have an offset; {_FAILED}", _MAP, lead=_NOT_READY),
     condition(A.SHADOW_P95, WARNING, "p95 error {metres:.1f} m", {"metres": "m"},
-              "5 % of the horizontal differences exceed N, which is above 6 m", WHILE,
-              "some fixes are wrong", _MAP, lead=_NOT_READY),
+              "5 % of the horizontal differences exceed N, which is above 6 m", _WITHIN,
+              f"some fixes are wrong; {_FAILED}", _MAP, lead=_NOT_READY),
     condition(A.SHADOW_COVARIANCE, WARNING, "error over claimed covariance", {},
               "the median horizontal difference is over three times what the covariance predicts",
-              WHILE, "fixes are less accurate than they state", _MAP, lead=_NOT_READY),
+              _WITHIN, f"fixes are less accurate than they state; {_FAILED}", _MAP,
+              lead=_NOT_READY),
     condition(A.SHADOW_HEIGHT, WARNING, "height {metres:+.0f} m; check geoid", {"metres": "m"},
-              "the median height difference N (vision minus EKF) exceeds 10 m", WHILE,
-              "geoid, vertical datum or barometer is wrong", _MAP,
+              "the median height difference N (vision minus EKF) exceeds 10 m", _WITHIN,
+              f"geoid, vertical datum or barometer is wrong; {_FAILED}", _MAP,
               lead=_NOT_READY),
     condition(A.SHADOW_YAW, WARNING, "yaw differs by {degrees:+.1f} deg", {"degrees": "deg"},
               "`yaw_mismatch` was active (until its end this is the text)",

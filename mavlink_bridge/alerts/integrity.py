@@ -91,8 +91,8 @@ INTEGRITY: tuple[AlertSpec, ...] = (
               "EKF rejects its position input ({ratio:.1f})", {"ratio": ""},
               "the test ratio N is above 1 for 2 s, while fixes are made",
               "N is 1 or less, or no fix is made, for 3 s",
-              "the EKF does not use its position input (the fixes; with injection off GNSS) and "
-              "drifts",
+              "the EKF does not use its position input (the fixes if its source set is vision, "
+              "otherwise GNSS; PX4: either) and drifts",
               _TAKE_OVER, raise_s=2.0, clear_s=3.0, repeat_s=10.0),
     AlertSpec(A.EKF_JUMP, WARNING, "EKF jump", "EKF jumped {metres:.0f} m, unconfirmed",
               {"metres": "m"},
@@ -146,7 +146,7 @@ MONITOR: tuple[AlertSpec, ...] = (
               "a check fails by a program fault, or the monitor's thread does not run for 2 s",
               "all checks run for 3 s",
               "no position is sent while the thread does not run, or once checks have failed for "
-              "1 s; a shorter failure drops one fix at most",
+              "1 s; before, only fixes whose own check failed are dropped",
               _TAKE_OVER, action=OutputAction.HOLD, clear_s=3.0,
               repeat_s=10.0),
     AlertSpec(A.FIXES_NOT_CHECKED, ERROR, "fix checks failed", "fix dropped: its checks failed", {},

@@ -94,7 +94,9 @@ def decode_version(flight_sw_version: int) -> Version:
 
 
 def select_profile(autopilot: str, version: Version | None) -> FirmwareProfile:
-    """The profile of `autopilot_name` and version (None: unknown); `GENERIC` for an unknown one."""
+    """The profile of `autopilot_name` and version. version None: not known yet, the newest known
+    profile. `GENERIC` for another autopilot, or before ArduPilot 4.5 or PX4 1.15.
+    """
     if autopilot == "ardupilot":
         if version is None or (4, 5, 0) <= version < (4, 8, 0):
             return ARDUPILOT

@@ -95,8 +95,9 @@ def fly(
     observers: FlightObservers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
 ) -> DemoRecord:
-    """Fly a scenario without GNSS. `folder` receives all records, also those of an aborted flight,
-    whose cause is in `DemoRecord.broken`. `SimulationError` if it fails before the mission.
+    """Fly a scenario, which may switch GNSS off. `folder` receives all records, also those of an
+    aborted flight, whose cause is in `DemoRecord.broken`. `SimulationError` if the vehicle, camera
+    or companion cannot be started, or the camera leaves no statistics.
 
     program: command line that starts the companion. observers: None: nothing is reported.
     """

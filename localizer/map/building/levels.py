@@ -82,7 +82,10 @@ class TopViewTile:
 
 
 def with_levels(tree: SourceTree) -> SourceTree:
-    """The tree with huge leaves cut into smaller tiles, and with coarser levels if it has none."""
+    """The tree with huge leaves cut into smaller tiles, and with coarser levels if no tile lies
+    below another, there are over `GROUP` leaves, and each states its corners. `MapSourceError` if a
+    huge leaf cannot be read.
+    """
     lat, lon, h = (float(x) for x in geodetic_from_ecef(tree.centre))
     origin = Geodetic(lat, lon, h)
     nodes = [node for node in tree.root.walk() if node.tiles and not node.children]
