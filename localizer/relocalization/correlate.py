@@ -1,9 +1,9 @@
 """Normalised correlation of one patch with a level of the overview, block by block, by FFT.
 
-A block is `SIZE` cells wide; a patch is compared at all origins of each at which the block contains
-it. They tile the map. What is summed over channels is a product of spectra, so that a patch costs
-one transform per channel and each block one inverse transform; the blocks' own spectra are kept
-within a budget.
+A block is `SIZE` cells wide; a patch is compared at every `ORIGIN_CELLS`th origin of each at which
+the block contains it. They tile the map. What is summed over channels is a product of spectra, so
+that a patch costs one transform per channel and each block one inverse transform; the blocks' own
+spectra are kept within a budget.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ SIZE = 256
 MOST_CELLS = 96  # of a patch's side
 _STEPS = (192, 160)  # origins of a block's side, for patches of up to 64 and 96 cells
 # Frequencies that are kept on each side: a quarter of a cycle per cell. Above are 1 % of the energy
-# of a map's features.
+# of a map's features. So the scores at every second origin determine those between them.
 _LOW = SIZE // 4
+ORIGIN_CELLS = 2
 _COARSE = 8  # cells of the map's energy that are summed before it is correlated
 # Spectra of so many blocks and patches are multiplied row by row, so that a row of all of them
 # stays in the cache: one block and one patch after the other took more than twice as long.
@@ -44,6 +45,11 @@ class Block:
     row: int
     column: int
     step: int
+
+    @property
+    def side(self) -> int:
+        """Number of compared origins, of each side."""
+        return self.step // ORIGIN_CELLS
 
 
 @dataclass(frozen=True)
@@ -74,14 +80,15 @@ class PatchSpectra:
 def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
     """Transform a patch. features: (n, n, K) weighted; mask: (n, n) in [0, 1]."""
     n = features.shape[0]
+    some = features[::ORIGIN_CELLS, ::ORIGIN_CELLS].transpose(2, 0, 1)
     # Row by row first: most rows are empty and stay so.
-    lines = scipy.fft.rfft(features.transpose(2, 0, 1), SIZE, axis=2, workers=1)
-    spectra = scipy.fft.fft(lines[:, :, : _LOW + 1], SIZE, axis=1, workers=1)
+    lines = scipy.fft.rfft(some, 2 * _LOW, axis=2, workers=1)
+    spectra = scipy.fft.fft(lines, 2 * _LOW, axis=1, workers=1)
     sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
     coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)
     norm = float(np.sqrt((features**2).sum()))
     return PatchSpectra(
-        _low(spectra),
+        spectra.astype(np.complex64, copy=False),
         np.ascontiguousarray(coarse, np.complex64),
         norm,
         n,
@@ -127,18 +134,18 @@ class LevelCorrelator:
         ]  # fmt: skip
 
     def correlate(self, patch: PatchSpectra, block: Block) -> Float32:
-        """Scores (step, step) of the patch at the block's origins."""
+        """Scores (side, side) of the patch at the block's compared origins."""
         return self.correlate_all([patch], [(0, block)])[0]
 
     def correlate_all(
         self, patches: Sequence[PatchSpectra], pairs: Sequence[tuple[int, Block]]
     ) -> list[Float32]:
-        """Scores (step, step) of each pair: number of a patch, and the block. At most
+        """Scores (side, side) of each pair: number of a patch, and the block. At most
         `PATCHES_TOGETHER` patches and `BLOCKS_TOGETHER` different blocks.
         """
         blocks = {b: k for k, b in enumerate(dict.fromkeys(b for _, b in pairs))}
         spectra = [self._spectra(b) for b in blocks]
-        products = np.zeros((len(pairs), SIZE, _LOW + 1), np.complex64)
+        products = np.empty((len(pairs), 2 * _LOW, _LOW + 1), np.complex64)
         _multiplied(
             _filled([s.features for s in spectra], BLOCKS_TOGETHER),
             _filled([p.features for p in patches], PATCHES_TOGETHER),
@@ -146,21 +153,21 @@ class LevelCorrelator:
             products.view(np.float32),
         )
         return [
-            self._normalised(product, spectra[blocks[b]], patches[n], b.step)
+            self._normalised(product, spectra[blocks[b]], patches[n], b.side)
             for product, (n, b) in zip(products, pairs, strict=True)
         ]
 
     def _normalised(
-        self, product: Complex64, block: _Spectra, patch: PatchSpectra, step: int
+        self, product: Complex64, block: _Spectra, patch: PatchSpectra, side: int
     ) -> Float32:
-        """Scores (step, step) from the product of the spectra, which is overwritten."""
+        """Scores (side, side) from the product of the spectra, which is overwritten."""
         # Only the first rows are origins: the others' last transform is left out.
-        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:step]
-        raw = scipy.fft.irfft(columns, SIZE, axis=1, workers=1)
+        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:side]
+        raw = scipy.fft.irfft(columns, 2 * _LOW, axis=1, workers=1)
         small = SIZE // _COARSE
         energy = scipy.fft.irfft2(block.energy * patch.mask.conj(), (small, small), workers=1)
         least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
-        scores = np.empty((step, step), np.float32)
+        scores = np.empty((side, side), np.float32)
         _normalised(raw, energy, np.float32(least), np.float32(max(patch.norm, 1e-9)), scores)
         return scores
 
@@ -235,13 +242,13 @@ def _filled(spectra: Sequence[Complex64], count: int) -> tuple[Float32, ...]:
 def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
     """Sum over channels of block * conj(patch) for each pair (m, 3): block, patch, place in out.
 
-    blocks, patches: (K, 2 _LOW, 2 n) each, out: (., SIZE, 2 n) float32, real and imaginary in turn.
+    blocks, patches: (K, 2 _LOW, 2 n) each, out: (., 2 _LOW, 2 n) float32, real and imaginary in
+    turn.
     """
     channels, rows, width = blocks[0].shape
     for i in range(rows):
-        at = i if i < _LOW else i + SIZE - 2 * _LOW
         for m in range(pairs.shape[0]):
-            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], at]
+            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], i]
             o[:] = 0
             for k in range(channels):
                 x, y = a[k, i], b[k, i]
@@ -252,15 +259,16 @@ def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _normalised(raw, energy, least, norm, out):  # type: ignore[no-untyped-def]
-    """Sample k of the coarse energy belongs to origin 8 k: between them it is interpolated."""
-    step = np.float32(1.0 / _COARSE)
+    """Sample k of the coarse energy belongs to cell 8 k: between them it is interpolated."""
+    each = _COARSE // ORIGIN_CELLS
+    step = np.float32(1.0 / each)
     for i in range(out.shape[0]):
-        p = i // _COARSE
-        a = (i - p * _COARSE) * step
-        for q in range(out.shape[1] // _COARSE):
+        p = i // each
+        a = (i - p * each) * step
+        for q in range(out.shape[1] // each):
             west = energy[p, q] + a * (energy[p + 1, q] - energy[p, q])
             east = energy[p, q + 1] + a * (energy[p + 1, q + 1] - energy[p, q + 1])
             slope = (east - west) * step
-            for b in range(_COARSE):
-                j = q * _COARSE + b
+            for b in range(each):
+                j = q * each + b
                 out[i, j] = raw[i, j] / (np.sqrt(max(west + b * slope, least)) * norm)

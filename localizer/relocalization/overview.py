@@ -50,7 +50,7 @@ _SAMPLE_SQUARES = 24  # that the principal components are computed from
 _GROUND_PERCENTILE = 30  # of the heights in a sample: lower than roofs and trees
 _LEAST_SHARE = 0.9  # of a square's cell that the map must cover to be compared
 
-_SEARCHED_BYTES = 16  # of the finest level's cell: its scores, their trials, and copies
+_SEARCHED_BYTES = 5  # of the finest level's cell: its scores, their trials, and copies
 _MOST_OF_MEMORY = 0.5  # of what is free
 
 Progress = Callable[[int, int], None]

@@ -6,9 +6,11 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from localizer.features.extractor import FeatureExtractor
@@ -18,6 +20,7 @@ from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import (
     BLOCKS_TOGETHER,
     MOST_CELLS,
+    ORIGIN_CELLS,
     PATCHES_TOGETHER,
     Block,
     LevelCorrelator,
@@ -47,6 +50,8 @@ _UNSEEN_PX = 9  # next to what is not seen, features are of the filling
 _SUPPRESSED_M = 12.0  # about a candidate, whose neighbours are no other place
 _LEAST_HEIGHT_M = 10.0
 _HEADINGS_TOGETHER = 3  # that share an extraction: its features are turned by up to 6 degrees
+_AT = np.arange(-3.0, 4.0) - np.array([[-0.5], [0.0], [0.5]])
+_TAPS = np.sinc(_AT) * np.sinc(_AT / 3) * (np.abs(_AT) < 3)  # Lanczos: half a sample to each side
 
 
 @dataclass(frozen=True)
@@ -146,8 +151,8 @@ def above_roofs(
 
 @dataclass
 class Scores:
-    """Best ratio of score to its trial's noise at each patch origin so far (rows, columns), and the
-    number of that trial.
+    """Best ratio of score to its trial's noise at each compared origin so far (rows, columns), and
+    the number of that trial.
     """
 
     best: Float32
@@ -217,7 +222,7 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class BlockScores:
-    """Scores (step, step) of one trial (heading and height) at the origins of each block that suits
+    """Scores (side, side) of one trial (heading and height) at the origins of each block that suits
     its height.
 
     noise: root mean square of the trial's scores over ground. Trials are compared by score divided
@@ -265,7 +270,7 @@ class _MapSearch:
 
     def empty(self) -> Scores:
         rows, columns = self.correlator.level.shape
-        shape = (rows + 2 * self.lead, columns + 2 * self.lead)
+        shape = tuple(-(-(n + 2 * self.lead) // ORIGIN_CELLS) for n in (rows, columns))
         return Scores(np.full(shape, -1.0, np.float32), np.zeros(shape, np.int32))
 
     def at_headings(
@@ -392,19 +397,21 @@ class _MapSearch:
         self, scores: Float32, block: Block, trial: Rectification, suits: NDArray[np.bool_]
     ) -> Float32:
         if not suits.all():
-            fine = suits.repeat(GROUND_CELLS, axis=0).repeat(GROUND_CELLS, axis=1)
+            each = GROUND_CELLS // ORIGIN_CELLS
+            fine = suits.astype(np.uint8).repeat(each, axis=0).repeat(each, axis=1)
+            fine = cv2.dilate(fine, np.ones((3, 3)))  # the last maxima are interpolated, too
             scores = np.where(fine, scores, np.float32(-1.0))
         if self.query.region is not None:
             scores = np.where(self.inside(block, trial, self.query.region), scores, -1.0)
         return scores.astype(np.float32, copy=False)
 
     def inside(self, block: Block, trial: Rectification, region: SearchRegion) -> NDArray[np.bool_]:
-        at = np.arange(block.step)
+        at = np.arange(0, block.step, ORIGIN_CELLS)
         rows, columns = at + block.row, at + block.column
         grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
         return region.contains(self.camera_at(grid, trial))
 
-    def camera_at(self, origin: NDArray[np.int64], trial: Rectification) -> Array:
+    def camera_at(self, origin: NDArray[Any], trial: Rectification) -> Array:
         """East and north (..., 2) of the camera whose patch begins at cell (..., 2)."""
         level = self.correlator.level
         middle = (np.asarray(origin, np.float64) + trial.cells / 2) * level.cell_m
@@ -415,8 +422,8 @@ class _MapSearch:
     def merge(self, scores: Scores, trial: int, found: BlockScores) -> None:
         rows, columns = scores.best.shape
         for block, values in found.blocks:
-            r, c = block.row + self.lead, block.column + self.lead
-            h, w = min(block.step, rows - r), min(block.step, columns - c)
+            r, c = ((k + self.lead) // ORIGIN_CELLS for k in (block.row, block.column))
+            h, w = min(block.side, rows - r), min(block.side, columns - c)
             window = np.s_[r : r + h, c : c + w]
             weighed = values[:h, :w] / np.float32(found.noise)
             better = weighed > scores.best[window]
@@ -425,8 +432,8 @@ class _MapSearch:
 
     def candidates(self, scores: Scores, trials: list[BlockScores]) -> list[PlaceCandidate]:
         """The highest peaks of `scores`, no two closer than `_SUPPRESSED_M`, in their order."""
-        best = scores.best.copy()
-        reach = max(2, round(_SUPPRESSED_M / self.correlator.level.cell_m))
+        best, moved = peaks(scores.best)
+        reach = max(1, round(_SUPPRESSED_M / (self.correlator.level.cell_m * ORIGIN_CELLS)))
         found: list[PlaceCandidate] = []
         while len(found) < self.config.candidates + 1:
             i, j = np.unravel_index(int(np.argmax(best)), best.shape)
@@ -434,7 +441,8 @@ class _MapSearch:
                 break
             chosen = trials[int(scores.trial[i, j])]
             trial, score = chosen.trial, float(best[i, j]) * chosen.noise
-            place = self.camera_at(np.array([i, j]) - self.lead, trial)
+            origin = (np.array([i, j]) + moved[i, j]) * ORIGIN_CELLS - self.lead
+            place = self.camera_at(origin, trial)
             pose = Pose(
                 with_heading(self.query.rotation, trial.heading_rad),
                 np.array([*place, self.query.height_m]),
@@ -442,6 +450,22 @@ class _MapSearch:
             found.append(PlaceCandidate(pose, score))
             best[max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1] = -1.0
         return found
+
+
+def peaks(values: Float32) -> tuple[Float32, Array]:
+    """Values (H, W) with their maxima interpolated at half a sample about each, and how far each
+    value was moved for that (H, W, 2), in samples. What has half of the highest value is none.
+    """
+    least = np.float32(values.max() / 2)
+    highest = values >= np.maximum(cv2.dilate(values, np.ones((3, 3))), least)
+    margin = _TAPS.shape[1] // 2
+    windows = sliding_window_view(np.pad(values, margin, mode="edge"), (_TAPS.shape[1],) * 2)
+    about = np.einsum("ai,nij,bj->nab", _TAPS, windows[highest], _TAPS, optimize=True)
+    flat = about.reshape(-1, 9)
+    result, moved = values.copy(), np.zeros((*values.shape, 2))
+    result[highest] = flat.max(axis=1)
+    moved[highest] = np.stack(np.divmod(flat.argmax(axis=1), 3), axis=-1) / 2 - 0.5
+    return result, moved
 
 
 def fitted(values: Float32, of: Rectification, to: Rectification) -> Float32:

@@ -14,7 +14,7 @@ from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.relocalization.align import FrameShift, displacement
 from localizer.relocalization.config import RelocalizationConfig
-from localizer.relocalization.correlate import LevelCorrelator, transform_patch
+from localizer.relocalization.correlate import ORIGIN_CELLS, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import footprint, rectify, with_heading
 from localizer.relocalization.search import (
@@ -24,6 +24,7 @@ from localizer.relocalization.search import (
     above_roofs,
     fitted,
     ground_of,
+    peaks,
     search,
     trial_heights,
 )
@@ -82,23 +83,25 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
 def test_scores_are_normalised_correlations():
     features = smooth(0, 288)
     n = 24
-    mask = np.ones((n, n), np.float32)
+    mask = np.zeros((n, n), np.float32)
+    mask[4:-4, 4:-4] = 1
     mask[:9, :14] = 0
-    patch = smooth(1, n).transpose(1, 2, 0) * mask[..., None]
+    # Of the patch every second cell is compared: it has to be smooth.
+    patch = smooth(1, n).transpose(1, 2, 0) * cv2.GaussianBlur(mask, (0, 0), 1.5)[..., None]
     correlator = LevelCorrelator(level(features), 1 << 26)
     spectra = transform_patch(patch, mask)
     checked = 0
     for block in correlator.blocks(n):
         scores = correlator.correlate(spectra, block)
-        for i, j in ((3, 5), (50, 90), (77, 120), (block.step - 1, 40)):
-            r, c = block.row + i, block.column + j
+        for i, j in ((1, 2), (25, 45), (38, 60), (block.side - 1, 20)):
+            r, c = block.row + i * ORIGIN_CELLS, block.column + j * ORIGIN_CELLS
             if min(r, c) < 0 or max(r, c) + n > 288:
                 continue
             window = features[:, r : r + n, c : c + n].transpose(1, 2, 0) * 0.01
             energy = ((window**2).sum(-1) * mask).sum()
             expected = (window * patch).sum() / np.sqrt(energy * (patch**2).sum())
             # The energy under the patch is summed over 8 cells and interpolated: a few per cent.
-            assert scores[i, j] == pytest.approx(expected, rel=0.1, abs=0.003)
+            assert scores[i, j] == pytest.approx(expected, rel=0.1, abs=0.01)
             checked += 1
     assert checked >= 6
 
@@ -121,17 +124,18 @@ def test_patches_and_blocks_together_score_as_each_pair_alone():
 
 
 @pytest.mark.parametrize("n", [40, 64, 65, 96])
-def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else(n):
+@pytest.mark.parametrize(("r", "c"), [(150, 200), (150, 201), (151, 201)])
+def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else(n, r, c):
     features = smooth(1, 320)
-    r, c = 150, 201
     cut = features[:, r : r + n, c : c + n].transpose(1, 2, 0).astype(np.float32) * 0.01
     correlator = LevelCorrelator(level(features), 0)  # no budget: nothing is kept
     spectra = transform_patch(cut, np.ones((n, n), np.float32))
     best = []
     for block in correlator.blocks(n):
-        scores = correlator.correlate(spectra, block)
-        i, j = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        best.append((float(scores[i, j]), block.row + i, block.column + j))
+        scores, moved = peaks(correlator.correlate(spectra, block))
+        at = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        row, column = (np.array(at) + moved[at]) * ORIGIN_CELLS
+        best.append((float(scores[at]), block.row + row, block.column + column))
     best.sort(reverse=True)
     assert best[0][1:] == (r, c)
     assert best[0][0] == pytest.approx(1.0, abs=0.05)
@@ -158,6 +162,25 @@ class SameFeatures:
         return FeaturePyramid(
             (FeatureLevel(features, np.ones((h, w), np.float32), 4),), 4 * w, 4 * h
         )
+
+
+@pytest.mark.parametrize(("r", "c"), [(150, 200), (150, 201), (151, 207)])
+def test_a_place_between_the_compared_origins_is_found_where_it_is(r, c):
+    """The last one is half a sample from ground so low that the height does not suit it."""
+    overview = level(smooth(8, 512))
+    n, step = 32, 1.09
+    overview.features[:, r : r + n, c : c + n] = smooth(9, n)
+    height = n * overview.cell_m / footprint(CAMERA, DOWN, 1.0, 9.0).side_m
+    low = height / step**0.5
+    overview.ground[:, 14:] = low - height * step**1.5
+    asked = query(heading_sigma_rad=0.01, height_m=low, height_sigma_m=0.0)
+    view = SearchView(np.full((120, 160, 3), 99, np.uint8), CAMERA)
+    apart = replace(CONFIG, extraction_ratio=1.0)
+    found = search(view, asked, (LevelCorrelator(overview, 0),), SameFeatures(), apart)
+    assert found is not None
+    at = found[0].world_from_camera.translation
+    np.testing.assert_allclose(at[:2] / overview.cell_m, (c + n / 2, -r - n / 2), atol=0.1)
+    assert found[0].score > 0.85
 
 
 def test_a_trials_noise_is_that_of_the_ground_it_was_compared_with(monkeypatch):
