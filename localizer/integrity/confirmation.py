@@ -65,8 +65,8 @@ def consistency_test(
     evidence: IndependentEvidence,
     config: IntegrityConfig,
 ) -> Consistency:
-    """Test a tentative track by another accepted pose (covariance (6, 6), exposure time_ns) and by
-    other sensors' evidence.
+    """Test a tentative track by another registered pose (covariance (6, 6), exposure time_ns) and
+    by other sensors' evidence.
     """
     if evidence.rotation is not None and not _attitude_agrees(pose, evidence.rotation, config):
         return Consistency.CONTRADICTED

@@ -99,7 +99,8 @@ HEALTH: tuple[AlertSpec, ...] = (
               "a frame is received, or after 3 s (`video_stalled`)", _NO_FIX, _VIDEO),
     condition(A.VIDEO_FAILED, ERROR, "video feed failed", {},
               "a file is damaged, or the first frames' aspect ratio or pixels cannot be used",
-              "the program ends at once (`ending`)", _NO_FIX,
+              "the program ends at once (`ending`); with `--supervised` it is restarted, except "
+              "in its first seconds", _NO_FIX,
               f"{_TAKE_OVER}; read the log, check the camera's settings"),
     condition(A.VIDEO_SIZE, ERROR, "video size does not fit the calibration", {},
               "frames change to another aspect ratio than `camera.model`, or to other pixels",

@@ -108,9 +108,9 @@ INJECTION: tuple[AlertSpec, ...] = (
               f"geoid, vertical datum or barometer is wrong; {_FAILED}", _MAP,
               lead=_NOT_READY),
     condition(A.SHADOW_YAW, WARNING, "yaw differs by {degrees:+.1f} deg", {"degrees": "deg"},
-              "`yaw_mismatch` was active (until its end this is the text)",
+              "`yaw_mismatch` has ended (while it is active, its own text is sent)",
               "50 fixes of the last 2 min are compared",
-              "compass or camera mounting is wrong",
+              f"compass or camera mounting is wrong; {_FAILED}",
               "check compass and camera mounting", lead=_NOT_READY),
     condition(A.SHADOW_RESTORED, WARNING, "failed before the restart", {},
               "at a restart: with this map the check had failed, before injection, in a process "

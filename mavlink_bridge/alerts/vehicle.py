@@ -179,7 +179,8 @@ VEHICLE: tuple[AlertSpec, ...] = (
           "their commands are denied",
           "add yours to `bridge.ground_systems`, or sign their links"),
     event(A.HINT_TAKEN, NOTICE, "search near given position, +-{metres:.0f} m", {"metres": "m"},
-          "the ground station gives the position; N: its sigma, at least 10 m, without one 100 m",
+          "a ground station gives the position by MAVLink; N: its sigma, at least 10 m, without "
+          "one 100 m",
           "searches of the next 2 min look only within 2 N", NOTHING),
     event(A.HINT_REFUSED, WARNING, "hint refused: not on the map", {},
           "the given position is over two of its sigmas off the map",

@@ -47,7 +47,8 @@ class Px4PositionInput(ExternalNavInput):
 
     def external_odometry(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
         """Take ODOMETRY in LOCAL_NED or LOCAL_FRD; the axes of LOCAL_FRD count as north and east.
-        Other frames, and a quality below EKF2_EV_QMIN, are ignored.
+        Other frames, and a quality below EKF2_EV_QMIN, are ignored. Of the velocity only one in
+        BODY_FRD, turned by `q`, is used; the heading is not.
         """
         p, stamp = self._parameters, clock.local_ms(message.time_usec, now_ms)
         if message.frame_id not in (_LOCAL_NED, _LOCAL_FRD):
