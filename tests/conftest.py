@@ -24,6 +24,7 @@ from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 from sitl.errors import SimulationError
+from sitl.vehicles.ardupilot import find_arducopter
 from tests.parts import PARTS, SHARED_FOLDER, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
@@ -247,9 +248,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     others = [item for item in items if not _wanted(item.path, config)]
     config.hook.pytest_deselected(items=others)
     items[:] = [item for item in items if item not in set(others)]
-    home = os.environ.get("ARDUPILOT_HOME")
-    path = os.pathsep.join(p for p in (home, os.environ.get("PATH")) if p)
-    if shutil.which("arducopter", path=path) is None:
+    if find_arducopter() is None:
         reason = pytest.mark.skip(reason="no arducopter on PATH or in ARDUPILOT_HOME")
         for item in items:
             if item.get_closest_marker("sitl"):
