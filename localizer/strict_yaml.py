@@ -73,9 +73,13 @@ def load_yaml(text: str) -> Any:
     """Parse a YAML document. yaml.YAMLError, with line and column, also for a repeated key, a merge
     key and a number to base 60 or 8.
 
-    As with `yaml.safe_load`, ValueError for an impossible date, RecursionError for endless nesting.
+    ValueError for an impossible date, or a tag that its value does not fit; RecursionError for
+    endless nesting.
     """
-    return yaml.load(text, Loader=_StrictLoader)
+    try:
+        return yaml.load(text, Loader=_StrictLoader)
+    except (AttributeError, LookupError) as error:  # PyYAML, of `!!bool x`, `!!timestamp x`
+        raise ValueError(f"a tag does not fit its value ({error})") from error
 
 
 def load_json(text: str) -> Any:

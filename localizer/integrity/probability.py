@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from localizer.errors import ModelError
 from localizer.geometry.pose import Array
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
@@ -45,13 +46,19 @@ class PlaceModel:
 
 @cache
 def place_model(path: Path = MODEL) -> PlaceModel:
-    """The fitted model in the JSON file at `path`. Each file is read once, on the first call."""
-    data = json.loads(path.read_text(encoding="utf-8"))
-    columns = [data["features"][name] for name in FEATURES]
-    mean, spread, weights = (
-        np.array([column[key] for column in columns]) for key in ("mean", "spread", "weight")
-    )
-    return PlaceModel(mean, spread, weights, float(data["bias"]))
+    """The fitted model in the JSON file at `path`. Each file is read once, on the first call.
+    `ModelError` if it is damaged.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        columns = [data["features"][name] for name in FEATURES]
+        mean, spread, weights = (
+            np.array([column[key] for column in columns], float)
+            for key in ("mean", "spread", "weight")
+        )
+        return PlaceModel(mean, spread, weights, float(data["bias"]))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise ModelError(f"{path}: damaged ({error!r}); install the program again") from error
 
 
 def place_features(result: Registration) -> Array | None:

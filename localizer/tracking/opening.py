@@ -12,6 +12,7 @@ from localizer.errors import ModelError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.geometry.camera import Camera
+from localizer.integrity.probability import place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
@@ -108,6 +109,7 @@ def _warm_up(
     config: LocalizerConfig,
 ) -> None:
     """Compile and load everything now; the first frame in flight must not wait ten seconds."""
+    place_model()
     size = working_camera(camera, config.width)
     black = np.zeros((size.height, size.width, 3), np.uint8)
     pyramid = extractor.extract(black)

@@ -100,8 +100,12 @@ def test_every_problem_is_named_by_its_key(tmp_path, change, named):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "- a\n- b\n", "map: [", "\x00", "map: 2026-13-41", "map: " + 500 * "["]
-)
+    "text",
+    [
+        "", "- a\n- b\n", "map: [", "\x00", "map: 2026-13-41", "map: " + 500 * "[",
+        "map: !!bool x", "map: !!timestamp x", "map: !!int ''",
+    ],
+)  # fmt: skip
 def test_files_that_are_no_mapping(tmp_path, text):
     with pytest.raises(ConfigError):
         load_config(_write(tmp_path, text))

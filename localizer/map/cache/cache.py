@@ -60,8 +60,8 @@ class Manifest(BaseModel):
     levels: int
     tiles: int
     triangles: int
-    bytes: int
-    extent: tuple[tuple[float, float], ...]
+    bytes: int = Field(lt=1 << 63)
+    extent: tuple[tuple[float, float], ...] = Field(min_length=1)
     height_range_m: tuple[float, float]
     build: dict[str, Any]
     skipped: dict[str, str]

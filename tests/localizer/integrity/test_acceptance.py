@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from localizer.errors import ModelError
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
 from localizer.integrity.confirmation import (
@@ -19,7 +21,7 @@ from localizer.integrity.confirmation import (
     TentativeTrack,
     consistency_test,
 )
-from localizer.integrity.probability import log_odds
+from localizer.integrity.probability import MODEL, log_odds, place_model
 from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
@@ -47,6 +49,18 @@ def _registration(**change: Any) -> Registration:
 def test_every_criterion_can_reject(change: dict[str, Any]) -> None:
     assert is_acceptable(CONFIG, _registration(), 1.0)
     assert not is_acceptable(CONFIG, _registration(**change), 1.0)
+
+
+def test_a_damaged_place_model_is_named(tmp_path: Path) -> None:
+    text = MODEL.read_text(encoding="utf-8")
+    missing = tmp_path / "missing.json"
+    damaged = ["", text[:200], "[]", '{"features": {}, "bias": 0}', text.replace("patch_peak", "x")]
+    files = [tmp_path / f"{k}.json" for k in range(len(damaged))]
+    for path, content in zip(files, damaged, strict=True):
+        path.write_text(content, encoding="utf-8")
+    for path in (missing, *files):
+        with pytest.raises(ModelError, match="install the program again"):
+            place_model(path)
 
 
 def test_a_contradicted_prediction_rejects() -> None:

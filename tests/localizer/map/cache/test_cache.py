@@ -92,6 +92,8 @@ _KIND = {"heights": "flat", "unknown_height_sigma_m": 6.0, "effective_resolution
         ({"geoid_separation_m": 1e5}, "geoid_separation_m"),
         ({"geoid_separation_m": float("nan")}, "geoid_separation_m"),
         ({"extent": [[float("inf"), 0.0]]}, "extent"),
+        ({"extent": []}, "extent"),
+        ({"bytes": 10**400}, "bytes"),
         ({"surprise": 1}, "surprise"),
         ({"kind": _KIND | {"unknown_height_sigma_m": 1001.0}}, "from 0 to 1000"),
         ({"kind": _KIND | {"unknown_height_sigma_m": True}}, "unknown_height_sigma_m"),
