@@ -27,6 +27,7 @@ from localizer.errors import MapCacheError
 from localizer.features.extractor import FeatureExtractor, model_key
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
+from localizer.plain_files import plain_bytes
 from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.render.base import MapRenderer
 from localizer.render.topview import render_top_view
@@ -339,7 +340,7 @@ def _principal(squares: Iterable[_SquareFeatures]) -> Projection:
 def _read(path: Path, gsd_m: float) -> OverviewLevel | None:
     """A level from disk; None if there is none, or a damaged one (named in the log)."""
     try:
-        data = path.read_bytes()
+        data = plain_bytes(path, None)
     except FileNotFoundError:
         return None
     except OSError as error:
