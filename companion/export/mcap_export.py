@@ -47,7 +47,7 @@ def require_extra() -> None:
         import_module("companion.export.mcap_file")
     except ImportError as error:
         raise ConfigError(
-            "MCAP needs its packages: pip install '.[mcap]' in a checkout, with the pip of the "
+            "MCAP needs its packages: pip install -e '.[mcap]' in a checkout, with the pip of the "
             f"program's environment: {error}"
         ) from error
 

@@ -23,6 +23,7 @@ from localizer.types import Frame, PosePrior, RegistrationStatus
 _PASSES = 3  # the view from a prior that is metres off shows another place
 _STEP_NS = 10_000_000_000  # between frames: no motion model carries from one photo to the next
 _REGION_SIGMAS, _LEAST_REGION_M = 3.0, 30.0
+_LEAST_SHARE = 0.15  # of a height above ground, from which an uncertain one is searched
 _HEIGHT_BANDS = 4  # of an unknown height, 15 to 150 m: a middle errs by 1.4 times at most
 _FOUND_HEIGHT_SHARE = 0.15  # heights of one flight differ by less, as a rule
 
@@ -145,10 +146,12 @@ def likely_height(prior: FramePrior, found_m: Sequence[float]) -> list[tuple[flo
 
 def height_bands(prior: FramePrior) -> list[tuple[float, float]]:
     """Split the range of an unknown height into four: (middle, half range), world z, m. A search
-    registers its candidates from the middle; from twice or half the true height that fails.
+    registers its candidates from the middle; from twice or half the true height that fails. The
+    range begins above the ground, also if the sigma is larger than the height above it.
     """
-    ground, half = prior.height_m - prior.clearance_m, prior.height_sigma_m
-    edges = np.geomspace(prior.clearance_m - half, prior.clearance_m + half, _HEIGHT_BANDS + 1)
+    clearance, half = prior.clearance_m, prior.height_sigma_m
+    ground, low = prior.height_m - clearance, max(clearance - half, _LEAST_SHARE * clearance)
+    edges = np.geomspace(low, clearance + half, _HEIGHT_BANDS + 1)
     return [(ground + (a + b) / 2, (b - a) / 2) for a, b in pairwise(map(float, edges))]
 
 

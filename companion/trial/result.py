@@ -27,7 +27,7 @@ _STILL_MPS = (0.0, 0.0)  # of photos: time stamps are no part of their positions
 class Trial:
     """All results. priors: corrected; first: localized with the telemetry as recorded; second: with
     estimated corrections; searched: without positions, by frame number; estimated: None if it
-    failed; reasons: of the frames that failed in `second`, by frame number.
+    failed; reasons: of the frames that failed in `best`, by frame number.
     """
 
     flight: RecordedFlight

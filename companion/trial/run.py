@@ -95,9 +95,9 @@ def run_trial(
                 ).values()
             )  # fmt: skip
         searched, left = _searched(flight, priors, loader, options.searches, stage)
-    why = reasons(flight.frames, priors, second, found, kind)
     notes = (*flight.notes, *known.notes, *left, *_map_notes(kind, flight))
-    return Trial(flight, priors, first, second, searched, found, why, notes)
+    trial = Trial(flight, priors, first, second, searched, found, {}, notes)
+    return replace(trial, reasons=reasons(flight.frames, priors, trial.best, found, kind))
 
 
 def evenly_spread(items: Sequence[int], most: int) -> list[int]:

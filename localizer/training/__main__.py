@@ -21,7 +21,7 @@ try:
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
-    typer.echo("training needs PyTorch: pip install '.[train]' in the source folder", err=True)
+    typer.echo("training needs PyTorch: pip install -e '.[train]' in the source folder", err=True)
     sys.exit(2)
 
 app = typer.Typer(

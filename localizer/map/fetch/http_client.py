@@ -17,7 +17,7 @@ try:
     import urllib3
 except ImportError as missing:
     raise MapFetchError(
-        "fetching a map needs urllib3: pip install '.[fetch]' in a checkout, with "
+        "fetching a map needs urllib3: pip install -e '.[fetch]' in a checkout, with "
         "the pip of the program's environment"
     ) from missing
 

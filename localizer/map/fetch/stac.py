@@ -29,7 +29,7 @@ def stac_files(source: CatalogueSource, area: Area, client: HttpClient) -> list[
     try:
         import pystac
     except ImportError as error:
-        raise MapFetchError("STAC needs pystac: pip install '.[fetch]' in a checkout") from error
+        raise MapFetchError("STAC needs pystac: pip install -e '.[fetch]' in a checkout") from error
 
     items = []
     try:

@@ -130,7 +130,7 @@ def _capabilities(source: CatalogueSource, client: HttpClient) -> Any:
     try:
         from owslib.wmts import WebMapTileService
     except ImportError as error:
-        raise MapFetchError("WMTS needs OWSLib: pip install '.[fetch]' in a checkout") from error
+        raise MapFetchError("WMTS needs OWSLib: pip install -e '.[fetch]' in a checkout") from error
 
     url = source.url
     if not url.lower().endswith(".xml") and "request=" not in url.lower():

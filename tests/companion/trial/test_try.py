@@ -214,6 +214,8 @@ def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_asse
     for true in (15.5, 30.0, 49.0, 100.0, 149.0):
         ((height, _),) = [(h, s) for h, s in bands if abs(h - true) <= s]
         assert 2 / 3 < height / true < 3 / 2
+    low = replace(prior, height_m=ground + 20.0, clearance_m=20.0, height_sigma_m=25.0)
+    assert [round(z - s - ground, 1) for z, s in height_bands(low)] == [3.0, 5.9, 11.6, 22.9]
 
 
 @pytest.mark.parametrize(

@@ -14,5 +14,5 @@ def test_a_machine_without_torch_is_told_in_one_line():
     )
     assert result.returncode == 2
     assert result.stderr.splitlines() == [
-        "training needs PyTorch: pip install '.[train]' in the source folder"
+        "training needs PyTorch: pip install -e '.[train]' in the source folder"
     ]
