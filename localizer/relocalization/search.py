@@ -441,8 +441,10 @@ class _MapSearch:
                 break
             chosen = trials[int(scores.trial[i, j])]
             trial, score = chosen.trial, float(best[i, j]) * chosen.noise
-            origin = (np.array([i, j]) + moved[i, j]) * ORIGIN_CELLS - self.lead
-            place = self.camera_at(origin, trial)
+            origin = np.array([i, j]) * ORIGIN_CELLS - self.lead
+            place = self.camera_at(origin + moved[i, j] * ORIGIN_CELLS, trial)
+            if self.query.region is not None and not self.query.region.contains(place):
+                place = self.camera_at(origin, trial)
             pose = Pose(
                 with_heading(self.query.rotation, trial.heading_rad),
                 np.array([*place, self.query.height_m]),
