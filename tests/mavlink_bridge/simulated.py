@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.generator.mavcrc import x25crc
 
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
@@ -247,3 +248,22 @@ class Flight:
         if at is None:
             return math.nan
         return abs(quat.wrap_pi(at.yaw_rad - self.yaw(self.now_ns - age_ns)))
+
+
+def heartbeat(autopilot: int = 3, *, armed: bool = True) -> Any:
+    """HEARTBEAT of a copter's autopilot."""
+    return mavlink.MAVLink_heartbeat_message(2, autopilot, 209 if armed else 81, 4, 4, 3)
+
+
+def origin_message(north_m: float) -> Any:
+    """GPS_GLOBAL_ORIGIN so far north of home."""
+    latitude, longitude = (round(degrees * 1e7) for degrees in (HOME[0] + north_m * METRE, HOME[1]))
+    return mavlink.MAVLink_gps_global_origin_message(latitude, longitude, 488_000, 0)
+
+
+def frame_of(known: Any, payload: bytes, system: int = 1, component: int = 1) -> bytes:
+    """A frame of any payload of a message class, its checksum right."""
+    header = bytes([len(payload), 0, 0, 0, system, component]) + known.id.to_bytes(3, "little")
+    crc = x25crc(header + payload)
+    crc.accumulate(bytes([known.crc_extra]))
+    return b"\xfd" + header + payload + crc.crc.to_bytes(2, "little")
