@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,6 +26,9 @@ from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.transport import Endpoint
 from mavlink_bridge.messages import PlaceHint, TrackRequest
 from mavlink_bridge.shared import Shared
+from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.vehicle.commands import Commander
+from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -248,6 +252,17 @@ class Flight:
         if at is None:
             return math.nan
         return abs(quat.wrap_pi(at.yaw_rad - self.yaw(self.now_ns - age_ns)))
+
+
+def exchanging(
+    configured: OriginConfig | None,
+) -> tuple[OriginExchange, Any, list[Alert]]:
+    """An exchange of the EKF's origin with a vehicle that is not armed, its link and its alerts."""
+    told: list[Alert] = []
+    tracker = VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), True)
+    config, notifier = BridgeConfig(origin=configured), StatusNotifier(told.append)
+    exchange = OriginExchange(config, tracker, Commander(191), notifier, Counter())
+    return exchange, SimulatedLink(system_id=1), told
 
 
 def heartbeat(autopilot: int = 3, *, armed: bool = True) -> Any:

@@ -7,8 +7,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.camera.component import CameraComponent
-from mavlink_bridge.camera.marks import Marks
+from mavlink_bridge.camera.component import CameraComponent, Marks
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
 

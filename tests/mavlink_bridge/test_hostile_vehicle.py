@@ -278,7 +278,7 @@ def silent(flight: Flight, turn: int) -> None:
 
 def missions(flight: Flight, turn: int) -> None:
     """Half an upload, again and again."""
-    flight.end.requests.mission.wanted = True
+    flight.end.mission.wanted = True
     to = (1, flight.shared.config.companion_component)
     flight.say(mavlink.MAVLink_mission_count_message(*to, (3, 65535, 0)[turn % 3]))
     flight.say(

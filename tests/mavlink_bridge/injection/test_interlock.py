@@ -11,7 +11,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import ChosenSet, GnssProblem, Output
-from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
+from mavlink_bridge.config import (
+    BridgeConfig,
+    InjectionConfig,
+    InjectionEnableConfig,
+    SourceSwitchConfig,
+)
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.shadow import ShadowScore
@@ -72,8 +77,8 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(monkeypatch, tm
 
     def begun(map_id: str) -> Flight:
         flight = on_gnss(monkeypatch, state_file=enable)
-        flight.end.set_map_id(map_id)
-        flight.end.recall()
+        flight.end.interlock.set_map_id(map_id)
+        flight.end.interlock.recall()
         return flight
 
     killed = begun("map a")
@@ -86,7 +91,7 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(monkeypatch, tm
     other.gnss_north_m = None
     other.run(10.0)
     assert other.vision()
-    other.end.end(clean_shutdown=False)
+    other.end.interlock.end(clean_shutdown=False)
     again = begun("map a")
     again.north_m, again.gnss_north_m = 20.0, None
     again.run(30.0)
@@ -99,7 +104,7 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(monkeypatch, tm
     while file.exists():
         pass
     for flight in (killed, again):
-        flight.end.end()
+        flight.end.interlock.end()
     assert not file.exists()
 
 
@@ -112,7 +117,7 @@ def test_who_has_begun_is_not_kept_from_beginning_by_a_restart(monkeypatch, tmp_
     flight.gnss_north_m = flight.ekf_north_m = 20.0
     flight.run(30.0)
     assert flight.end.shadow_score(flight.now_ns).against
-    flight.end.end(clean_shutdown=False)  # what is stored is on the disk then
+    flight.end.interlock.end(clean_shutdown=False)  # what is stored is on the disk then
     assert not (tmp_path / "shadow-no-go.json").exists()
 
 
@@ -377,7 +382,7 @@ class Compared:
     def __init__(self) -> None:
         self._go, self._compared_ns = False, 0
         self._interlock = ShadowInterlock(
-            False,
+            BridgeConfig(),
             lambda _: ShadowScore(self._go, 100, () if self._go else (RATE,)),
             lambda: self._compared_ns,
             StatusNotifier(lambda _: None),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -25,6 +26,7 @@ from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScore, ShadowScorer
 from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.profile import ARDUPILOT, GENERIC, FirmwareProfile
 from tests.mavlink_bridge.simulated import HOME, METRE, MS, SECOND
 
@@ -189,30 +191,38 @@ def test_a_jump_after_one_that_was_given_up_is_repeated_again() -> None:
 CONFIG = SourceSwitchConfig(enabled=True, bad_after_s=1.5)
 
 
-def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) -> list[Any]:
-    """Decide ten times a second; orders are acknowledged. how: see the body."""
-    orders = []
-    for i in range(int(seconds * 10)):
-        now = int((start + i / 10) * SECOND) + SECOND
-        gps = how.get("gps", True)
-        state = vehicle(
-            now if gps else 0,
-            gps_fix_type=3 if gps else 0,
-            ekf_flags=GOOD_FLAGS | how.get("flags", 0),
-            gps_h_accuracy_m=how.get("claimed", 1.0),
-            latitude_deg=HOME[0] + how.get("ekf", how.get("north", 0.0)) * METRE,
-            longitude_deg=HOME[1],
-        )
-        seen = now - (100 * MS if how.get("seen", True) else 60 * SECOND)
-        vision = position(seen, how.get("north", 0.0), speed=how.get("speed", 0.0))
-        order = switch.decide(
-            now, state, vision, good=how.get("good", True), may_switch=how.get("proven", True)
-        )
-        if order is not None:
-            orders.append((start + i / 10, order))
-            if how.get("acknowledge", True):
-                switch.acknowledged(True)
-    return orders
+class Switch(SourceSwitch):
+    """Whose orders are acknowledged. told: the alerts."""
+
+    def __init__(self, config: SourceSwitchConfig = CONFIG) -> None:
+        self.told: list[Alert] = []
+        self._sent: list[int] = []
+        commander: Any = SimpleNamespace(send=lambda _, __, number: self._sent.append(number))
+        super().__init__(config, commander, StatusNotifier(self.told.append), Counter())
+
+    def drive(self, seconds: float, start: float = 0.0, **how: Any) -> list[tuple[float, int]]:
+        """Decide ten times a second; times and sets of the orders. how: see the body."""
+        orders = []
+        for i in range(int(seconds * 10)):
+            now = int((start + i / 10) * SECOND) + SECOND
+            gps = how.get("gps", True)
+            state = vehicle(
+                now if gps else 0,
+                gps_fix_type=3 if gps else 0,
+                ekf_flags=GOOD_FLAGS | how.get("flags", 0),
+                gps_h_accuracy_m=how.get("claimed", 1.0),
+                latitude_deg=HOME[0] + how.get("ekf", how.get("north", 0.0)) * METRE,
+                longitude_deg=HOME[1],
+            )
+            seen = now - (100 * MS if how.get("seen", True) else 60 * SECOND)
+            vision = position(seen, how.get("north", 0.0), speed=how.get("speed", 0.0))
+            good, may_switch = how.get("good", True), how.get("proven", True)
+            link: Any = None
+            self.tick(link, state, vision, good=good, may_switch=may_switch, now_ns=now)
+            if self._sent:
+                orders.append((start + i / 10, self._sent.pop()))
+                self.acknowledged(True)
+        return orders
 
 
 @pytest.mark.parametrize(
@@ -224,19 +234,19 @@ def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) 
     ],
 )
 def test_bad_gnss_switches_once_to_vision(how: dict[str, Any], reason: str) -> None:
-    switch = SourceSwitch(CONFIG)
-    assert drive(switch, 5.0) == []
-    orders = drive(switch, 6.0, 5.0, **how)
-    assert [(o.source_set, o.cause) for _, o in orders] == [(2, reason)]
-    assert orders[0][0] == pytest.approx(6.5, abs=0.15)
+    switch = Switch()
+    assert switch.drive(5.0) == []
+    orders = switch.drive(6.0, 5.0, **how)
+    assert orders == [(pytest.approx(6.5, abs=0.15), 2)]
+    assert [a.values[:2] for a in switch.told] == [(2, reason)]
     assert switch.current == 2
 
 
 def test_short_fault_switches_nothing() -> None:
-    switch = SourceSwitch(CONFIG)
+    switch = Switch()
     for i in range(10):
-        assert drive(switch, 1.0, 4.0 * i, gps=False) == []
-        assert drive(switch, 3.0, 4.0 * i + 1.0) == []
+        assert switch.drive(1.0, 4.0 * i, gps=False) == []
+        assert switch.drive(3.0, 4.0 * i + 1.0) == []
 
 
 @pytest.mark.parametrize(
@@ -249,57 +259,58 @@ def test_short_fault_switches_nothing() -> None:
     ],
 )
 def test_what_switches_nothing(config: SourceSwitchConfig, how: dict[str, Any]) -> None:
-    assert drive(SourceSwitch(config), 10.0, **how) == []
+    assert Switch(config).drive(10.0, **how) == []
 
 
 def test_a_receiver_that_claims_to_be_bad_hides_nothing() -> None:
-    orders = drive(SourceSwitch(CONFIG), 5.0, north=60.0, claimed=12.0)
-    assert [order.cause for _, order in orders] == ["GNSS off vision"]
+    switch = Switch()
+    switch.drive(5.0, north=60.0, claimed=12.0)
+    assert [a.values[1] for a in switch.told] == ["GNSS off vision"]
 
 
 def test_back_to_gnss_only_if_configured_and_once_it_was_compared() -> None:
-    never = SourceSwitch(CONFIG)
-    drive(never, 5.0, gps=False)
-    assert drive(never, 60.0, 5.0) == []
-    back = SourceSwitch(CONFIG.model_copy(update={"return_to_gnss": True}))
-    drive(back, 5.0, gps=False)
+    never = Switch()
+    never.drive(5.0, gps=False)
+    assert never.drive(60.0, 5.0) == []
+    back = Switch(CONFIG.model_copy(update={"return_to_gnss": True}))
+    back.drive(5.0, gps=False)
     for i in range(5):
         # A receiver that comes and goes does not bring it back.
-        assert drive(back, 4.5, 5.0 + 10 * i) == []
-        assert drive(back, 5.5, 9.5 + 10 * i, gps=False) == []
-    orders = drive(back, 10.0, 55.0)
-    assert [order.source_set for _, order in orders] == [1]
+        assert back.drive(4.5, 5.0 + 10 * i) == []
+        assert back.drive(5.5, 9.5 + 10 * i, gps=False) == []
+    orders = back.drive(10.0, 55.0)
+    assert [source_set for _, source_set in orders] == [1]
 
 
 def test_no_return_to_a_far_receiver_of_which_nobody_says_that_it_is_bad() -> None:
     """Vision ended, and with it the only word against a spoofed receiver that says it is well."""
-    back = SourceSwitch(CONFIG.model_copy(update={"return_to_gnss": True}))
-    drive(back, 5.0, north=60.0)
+    back = Switch(CONFIG.model_copy(update={"return_to_gnss": True}))
+    back.drive(5.0, north=60.0)
     assert back.current == 2
-    assert drive(back, 60.0, 5.0, seen=False, ekf=60.0) == []
-    orders = drive(back, 12.0, 65.0)
-    assert [order.source_set for _, order in orders] == [1]
+    assert back.drive(60.0, 5.0, seen=False, ekf=60.0) == []
+    orders = back.drive(12.0, 65.0)
+    assert [source_set for _, source_set in orders] == [1]
 
 
 def test_no_switch_without_a_go_of_the_shadow_score() -> None:
-    switch = SourceSwitch(CONFIG)
-    assert drive(switch, 10.0, proven=False, gps=False) == []
-    assert switch.refusal.values[2] == "not ready"
+    switch = Switch()
+    assert switch.drive(10.0, proven=False, gps=False) == []
+    assert {a.values[2] for a in switch.told} == {"not ready"}
 
 
 def test_back_to_sound_gnss_once_vision_is_gone() -> None:
-    switch = SourceSwitch(CONFIG)
-    drive(switch, 5.0, gps=False)
-    assert drive(switch, 20.0, 5.0, gps=False, seen=False) == []
-    orders = drive(switch, 6.0, 25.0, seen=False)
-    assert [order.source_set for _, order in orders] == [1]
+    switch = Switch()
+    switch.drive(5.0, gps=False)
+    assert switch.drive(20.0, 5.0, gps=False, seen=False) == []
+    orders = switch.drive(6.0, 25.0, seen=False)
+    assert [source_set for _, source_set in orders] == [1]
     assert orders[0][0] == pytest.approx(28.0, abs=0.2)
-    other = SourceSwitch(CONFIG)
-    drive(other, 5.0, gps=False)
+    other = Switch()
+    other.drive(5.0, gps=False)
     # Not to one that is far from where the vehicle went by itself, and not for a gap in vision.
-    assert drive(other, 20.0, 5.0, seen=False, ekf=60.0) == []
-    drive(other, 5.0, 25.0, ekf=60.0)
-    assert drive(other, 2.0, 30.0, seen=False) == []
+    assert other.drive(20.0, 5.0, seen=False, ekf=60.0) == []
+    other.drive(5.0, 25.0, ekf=60.0)
+    assert other.drive(2.0, 30.0, seen=False) == []
 
 
 # --- a receiver that returns --------------------------------------------------------------------
@@ -366,12 +377,12 @@ def test_a_wrong_receiver_is_refused_with_its_reason(how: dict[str, Any], why: s
 
 def test_what_was_refused_is_not_taken_when_vision_ends() -> None:
     """20 m from where the EKF came by itself would do, but vision had said that it is wrong."""
-    switch = SourceSwitch(CONFIG)
-    drive(switch, 5.0, gps=False)
-    drive(switch, 5.0, 5.0, north=20.0)
-    assert drive(switch, 20.0, 10.0, north=20.0, seen=False) == []
-    drive(switch, 5.0, 30.0, gps=False, seen=False)
-    assert [o.source_set for _, o in drive(switch, 8.0, 35.0, seen=False)] == [1]
+    switch = Switch()
+    switch.drive(5.0, gps=False)
+    switch.drive(5.0, 5.0, north=20.0)
+    assert switch.drive(20.0, 10.0, north=20.0, seen=False) == []
+    switch.drive(5.0, 30.0, gps=False, seen=False)
+    assert [source_set for _, source_set in switch.drive(8.0, 35.0, seen=False)] == [1]
 
 
 # --- Who opens and closes the gate of mode ``rc``: the newest word of channel or command --------

@@ -17,7 +17,7 @@ import pytest
 from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge import Bridge, BridgeConfig, VehicleState
 from mavlink_bridge.config import CameraConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError, EndpointError
 from mavlink_bridge.link.framing import FrameReader
@@ -456,38 +456,53 @@ def test_waking_a_link_that_is_stopped_writes_into_nobody_elses_file(monkeypatch
 # --- streams ------------------------------------------------------------------------------------
 
 
-def names(keeper: StreamKeeper, config: BridgeConfig, now_s: float) -> set[str]:
-    return {s.name for s in keeper.due(wanted_streams(config, "ardupilot"), int(now_s * SECOND))}
+class Asking:
+    """A keeper of streams, and what it asks for."""
+
+    def __init__(self) -> None:
+        self._asked: list[float] = []
+        commander: Any = SimpleNamespace(send=self._send)
+        self.keeper = StreamKeeper(BridgeConfig(), commander)
+
+    def _send(self, _: Any, command: int, message_id: float, *__: float) -> None:
+        if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self._asked.append(message_id)
+
+    def at(self, now_s: float) -> set[str]:
+        """Names of the messages that are asked for."""
+        self._asked.clear()
+        state = VehicleState(autopilot="ardupilot")
+        self.keeper.tick(None, state, int(now_s * SECOND))  # type: ignore[arg-type]
+        return {mavlink.mavlink_map[int(number)].msgname for number in self._asked}
 
 
 def test_streams_are_asked_once_while_they_flow_and_again_when_they_stop() -> None:
-    keeper, config = StreamKeeper(), BridgeConfig()
-    assert "ATTITUDE" in names(keeper, config, 10.0)
+    asking = Asking()
+    assert "ATTITUDE" in asking.at(10.0)
     for t in range(11, 20):
-        keeper.on_message("ATTITUDE", t * SECOND)
-        assert "ATTITUDE" not in names(keeper, config, t + 0.5)
-    assert "ATTITUDE" in names(keeper, config, 25.0)
+        asking.keeper.on_message("ATTITUDE", t * SECOND)
+        assert "ATTITUDE" not in asking.at(t + 0.5)
+    assert "ATTITUDE" in asking.at(25.0)
 
 
 def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() -> None:
-    keeper, config = StreamKeeper(), BridgeConfig()
-    asked = [names(keeper, config, 10.0 + 2.5 * i) for i in range(12)]
+    silent, flowing = Asking(), Asking()
+    asked = [silent.at(10.0 + 2.5 * i) for i in range(12)]
     new, old = "GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_STATUS"
     assert [new in a for a in asked[:4]] == [True, True, False, False]
     assert old not in asked[0] | asked[1]
     assert sum(old in a for a in asked) == 2
-    flowing = StreamKeeper()
     for t in range(10, 30):
-        flowing.on_message(new, t * SECOND)
-        assert old not in names(flowing, config, t + 0.1)
+        flowing.keeper.on_message(new, t * SECOND)
+        assert old not in flowing.at(t + 0.1)
 
 
 def test_evidence_that_an_autopilot_did_not_hear_of_is_asked_for_again() -> None:
     """IMU and barometer were asked for twice in the first seconds, while it still booted, and the
     monitor flew without either, untold. One that does not know them is asked once a minute.
     """
-    keeper, config = StreamKeeper(), BridgeConfig()
-    asked = ["RAW_IMU" in names(keeper, config, 10.0 + 2.5 * i) for i in range(90)]
+    asking = Asking()
+    asked = ["RAW_IMU" in asking.at(10.0 + 2.5 * i) for i in range(90)]
     assert asked[:4] == [True, True, False, False]
     assert 2 < sum(asked) <= 5
 

@@ -20,11 +20,11 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.status_notifier import StatusNotifier
-from mavlink_bridge.vehicle.origin import OriginKeeper, north_east
+from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
-from tests.mavlink_bridge.simulated import MS, SECOND
+from tests.mavlink_bridge.simulated import MS, SECOND, exchanging
 
 
 def sent(message: Any, system: int = 1, component: int = 1) -> Any:
@@ -254,20 +254,22 @@ def test_scaling_is_ardupilots_own() -> None:
 
 def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     configured = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
-    keeper = OriginKeeper(configured)
-    asked: list[int] = []
-    messages = [keeper.tick(i * SECOND, 1, asked.append) for i in range(1, 6)]
-    assert asked == [49] * 5
-    assert [m is None for m in messages] == [True] * 3 + [False, True]
+    exchange, link, told = exchanging(configured)
+    for second in range(1, 6):
+        exchange.tick(link, second * SECOND, may_set=True)
+    kinds = [m.get_type() for _, m, _ in link.sent]
+    assert kinds == [*["COMMAND_LONG"] * 4, "SET_GPS_GLOBAL_ORIGIN", "COMMAND_LONG"]
+    assert {m.param1 for _, m, _ in link.sent if m.get_type() == "COMMAND_LONG"} == {49}
     # What firmwares send before they have one.
-    keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), armed=False)
-    assert keeper.origin is None
+    exchange.on_message(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), 6 * SECOND)
+    assert exchange.origin is None
     # The vehicle has another one: ours is ignored, and so must positions be relative to the read.
     read = mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000)
-    news = keeper.on_origin(read, armed=True)
-    assert news.id is AlertId.ORIGIN_DIFFERS
-    assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
-    assert keeper.tick(10 * SECOND, 1, asked.append) is None
+    exchange.on_message(read, 6 * SECOND)
+    assert [a.id for a in told] == [AlertId.ORIGIN_DIFFERS]
+    assert exchange.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
+    exchange.tick(link, 10 * SECOND, may_set=True)
+    assert len(link.sent) == 7  # only asked again
 
 
 # --- profiles ---------------------------------------------------------------------------------
