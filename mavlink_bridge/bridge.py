@@ -386,15 +386,6 @@ class Bridge:
         result["ekf_source_set"] = self._fc.sources.current
         return result
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of messages, samples or bytes that each queue holds, by its name."""
-        result = {"alerts": len(self._status.alerts()), **self._fc.queue_lengths()}
-        if self._ground is not self._fc.components:
-            result.update({f"ground {name}": n for name, n in self._ground.queue_lengths().items()})
-        for link in self._links:
-            result.update({f"{link.name} {name}": n for name, n in link.queue_lengths().items()})
-        return result
-
 
 def _link(
     config: BridgeConfig,

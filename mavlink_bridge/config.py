@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from mavlink_bridge.errors import EndpointError
+from mavlink_bridge.link.transport import Endpoint, parse_sender
 
 InjectionMessage = Literal[
     "vision_position_estimate",
@@ -198,7 +202,7 @@ class TargetsConfig(StrictModel):
     @classmethod
     def _is_host_and_port(cls, value: str) -> str:
         if value:
-            _check_endpoint(f"udpout:{value}", "write host:port")
+            _check(Endpoint.parse, f"udpout:{value}", "write host:port")
         return value
 
 
@@ -299,20 +303,14 @@ class BridgeConfig(StrictModel):
     @classmethod
     def _connection_is_an_endpoint(cls, value: str | None) -> str | None:
         if value is not None:
-            _check_endpoint(value)
+            _check(Endpoint.parse, value)
         return value
 
     @field_validator("sender")
     @classmethod
     def _is_a_sender(cls, value: str | None) -> str | None:
         if value is not None:
-            from mavlink_bridge.errors import EndpointError
-            from mavlink_bridge.link.transport import parse_sender
-
-            try:
-                parse_sender(value)
-            except EndpointError as error:
-                raise ValueError(str(error)) from error
+            _check(parse_sender, value)
         return value
 
     @model_validator(mode="after")
@@ -355,11 +353,8 @@ class BridgeConfig(StrictModel):
         return self
 
 
-def _check_endpoint(text: str, hint: str = "") -> None:
-    from mavlink_bridge.errors import EndpointError
-    from mavlink_bridge.link.transport import Endpoint
-
+def _check(parse: Callable[[str], object], text: str, hint: str = "") -> None:
     try:
-        Endpoint.parse(text)
+        parse(text)
     except EndpointError as error:
         raise ValueError(hint or str(error)) from error

@@ -159,11 +159,6 @@ class FlightControllerEnd:
         result["fixes_not_taken"] = self.sender.dropped
         return result
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of entries in each queue, by name."""
-        parts = (self.sender, self.outcome, self.components, self.time_sync)
-        return {name: length for part in parts for name, length in part.queue_lengths().items()}
-
     # --- messages in ----------------------------------------------------------------------------
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:

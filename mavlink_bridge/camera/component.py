@@ -149,11 +149,6 @@ class CameraComponent:
         self._idle_ns = 0
         self._idle_left = _IDLE_TIMES
 
-    @property
-    def targets(self) -> int:
-        """Number of reported targets."""
-        return len(self._targets)
-
     def report(self, target: TargetReport) -> None:
         """Set the newest fix of a target, to be sent by `tick`."""
         self._targets[target.target_id] = target

@@ -213,14 +213,6 @@ class Link:
         mine = {**asdict(self.counters), "rx_of_strangers": refused}
         return {**mine, **asdict(self._reader.counters)}
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Lengths of the queues: messages of other threads (outbox), bytes to send and received."""
-        return {
-            "outbox": len(self._outbox),
-            "unsent": len(self._unsent),
-            "unread": self._reader.waiting,
-        }
-
     # --- owner thread ---------------------------------------------------------------------------
 
     def _run(self) -> None:

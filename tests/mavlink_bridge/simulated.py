@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -238,13 +238,9 @@ class Flight:
         for decoded in self.reader.feed(self.mangle(frame)):
             self.end.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Lengths of everything that could grow."""
-        return {
-            **self.end.queue_lengths(),
-            "bytes": self.reader.waiting,
-            "sequences": self.reader.sources,
-        }
+    def longest(self) -> int:
+        """Length of the longest of all collections, any of which might grow."""
+        return max((lengths(self.end) | lengths(self.reader)).values())
 
     def attitude_error(self, age_ns: int = 200 * MS) -> float:
         """Error of the interpolated yaw at an exposure, rad; NaN while there is none."""
@@ -252,6 +248,21 @@ class Flight:
         if at is None:
             return math.nan
         return abs(quat.wrap_pi(at.yaw_rad - self.yaw(self.now_ns - age_ns)))
+
+
+def lengths(of: Any, seen: set[int] | None = None) -> dict[str, int]:
+    """The length of each collection that an object holds, and the bridge's objects in it, by the
+    attribute's name; the longest of those of one name.
+    """
+    seen, found = seen or {id(of)}, Counter[str]()
+    for name, value in list(vars(of).items()):
+        ours = type(value).__module__.startswith("mavlink_bridge") and hasattr(value, "__dict__")
+        if isinstance(value, deque | dict | list | set | bytearray):
+            found |= Counter({name.lstrip("_"): len(value)})
+        elif ours and id(value) not in seen:
+            seen.add(id(value))
+            found |= Counter(lengths(value, seen))
+    return found
 
 
 def exchanging(

@@ -20,7 +20,15 @@ from mavlink_bridge.flight_controller import FC_WANTED
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
-from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink, frame_of
+from tests.mavlink_bridge.simulated import (
+    HOME,
+    MS,
+    SECOND,
+    Flight,
+    SimulatedLink,
+    frame_of,
+    lengths,
+)
 
 LATE = (AlertId.FIXES_LATE, AlertId.FIXES_OVER_LIMIT)
 
@@ -42,7 +50,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     flight.north_m, flight.ekf_north_m, flight.reset_count = 25.0, 25.0, 1
     flight.run(200.0)
     lost_ns = flight.now_ns
-    assert max(flight.queue_lengths().values()) <= 256
+    assert flight.longest() <= 512
     flight.link.open = True
     flight.run(10.0)
     after = flight.vision(lost_ns)
@@ -55,7 +63,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     assert flight.end.counters["reboots"] == 0
     # Only what is fresh: nothing that waited during the loss.
     assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
-    assert max(flight.queue_lengths().values()) <= 256
+    assert flight.longest() <= 512
     flight.reboot()
     flight.run(10.0)
     assert not flight.told(AlertId.TIMESYNC_UNANSWERED)  # a link that was gone owes no answers
@@ -226,7 +234,7 @@ def test_damaged_frames_on_the_flight_controllers_link(monkeypatch, seed):
     assert not flight.told(AlertId.DUPLICATE_SYSTEM_ID)
     assert {m.reset_counter for _, m in flight.vision()} == {0}
     assert len(flight.vision(flight.now_ns - 60 * SECOND)) > 550
-    assert max(flight.queue_lengths().values()) < 1024
+    assert flight.longest() <= 512
 
 
 def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
@@ -248,7 +256,7 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight,
         if i % 40 == 0:
             flight.run(0.05)
             ground.on_tick(link, flight.now_ns)  # type: ignore[arg-type]
-    assert max(flight.queue_lengths().values()) < 1024
+    assert flight.longest() <= 512
     # Even a lying autopilot is believed again once it speaks the truth.
     flight.reboot()
     flight.run(30.0)
@@ -409,7 +417,7 @@ def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> No
     hour = 3600 * SECOND
     flight.end.components.queue_item(TargetReport(flight.now_ns + hour, *HOME, 500.0))
     flight.run(1.0)
-    assert flight.queue_lengths()["targets"] == 0
+    assert not lengths(flight.end)["targets"]
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
 
 

@@ -26,6 +26,7 @@ from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint, UdpTransport, open_transport
 from mavlink_bridge.link.waking import WakePipe
 from mavlink_bridge.vehicle.streams import StreamKeeper, wanted_streams
+from tests.mavlink_bridge.simulated import lengths
 
 SECOND = 1_000_000_000
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
@@ -274,7 +275,7 @@ def test_tcp_is_reopened_when_the_server_goes_and_comes_back(start):
     link, handler = start(f"tcp:127.0.0.1:{port}")
     first, _ = server.accept()
     first.sendall(packed() + packed()[:7])
-    assert sleep_until(lambda: link.queue_lengths()["unread"] == 7, 30.0)
+    assert sleep_until(lambda: lengths(link)["buffer"] == 7, 30.0)
     first.close()
     server.close()
     assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
@@ -310,7 +311,7 @@ def test_peer_that_does_not_read_costs_messages_not_memory_or_time(start):
             time.sleep(0.002)
         assert time.monotonic() - begun < 60.0  # a send that blocked once would never end
         assert sleep_until(lambda: link.counters.tx_dropped > 1000, 30.0)
-        assert link.queue_lengths()["unsent"] < 128 * 1024
+        assert lengths(link)["unsent"] < 128 * 1024
         deaf.close()
 
 

@@ -21,6 +21,7 @@ from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
 from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
 from mavlink_bridge.status import OperatorStatus
 from mavlink_bridge.vehicle.presence import VehicleWatch
+from tests.mavlink_bridge.simulated import lengths
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
 
@@ -69,7 +70,7 @@ def test_the_handlers_clock_goes_on_while_the_transport_is_closed(monkeypatch):
         link.send(HEARTBEAT, 191)
     link.start()
     link.stop()
-    assert link.queue_lengths()["outbox"] == 0
+    assert lengths(link)["outbox"] == 0
     waits = [b - a for a, b in itertools.pairwise(attempts)]
     assert max(waits) == pytest.approx(5.0, abs=0.01)  # a tick at each attempt only would leave it
     assert max(b - a for a, b in itertools.pairwise(ticks.times)) <= 0.21
@@ -198,12 +199,13 @@ def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
     """Well and ill by turns for a minute: each bad text once in 10 s, the end once it lasts.
     What is worse is told at once.
     """
-    told: list[Alert] = []
-    status = OperatorStatus(lambda *_: None, told.append)
+    told, now_ns = list[Alert](), [0]
+    status = OperatorStatus(lambda *_: None, told.append, lambda: now_ns[0])
     tracking, failed = alert(AlertId.TRACKING), alert(AlertId.NO_FRAME)
 
     def report(at_s: int, level: HealthLevel, news: Alert) -> None:
-        status.set_health(level, [news], tell=True, now_ns=at_s * 10**9)
+        now_ns[0] = at_s * 10**9
+        status.set_health(level, [news], tell=True)
         assert status.level is level  # the heartbeats say what is
 
     report(0, HealthLevel.OK, tracking)
@@ -225,10 +227,12 @@ def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
 
 def test_a_loss_that_returns_is_reported_beside_an_alert_that_stays() -> None:
     """While the search hangs, only the first of five losses was sent."""
-    told: list[Alert] = []
-    status = OperatorStatus(lambda *_: None, told.append)
+    told, now_ns = list[Alert](), [0]
+    status = OperatorStatus(lambda *_: None, told.append, lambda: now_ns[0])
     hangs, lost = alert(AlertId.SEARCH_HANGS), alert(AlertId.NO_FRAME)
     for at_s in range(0, 300, 60):
-        status.set_health(HealthLevel.FAILED, [lost, hangs], tell=True, now_ns=at_s * 10**9)
-        status.set_health(HealthLevel.DEGRADED, [hangs], tell=True, now_ns=(at_s + 30) * 10**9)
+        now_ns[0] = at_s * 10**9
+        status.set_health(HealthLevel.FAILED, [lost, hangs], tell=True)
+        now_ns[0] += 30 * 10**9
+        status.set_health(HealthLevel.DEGRADED, [hangs], tell=True)
     assert told == [lost, hangs, *[lost] * 4]
