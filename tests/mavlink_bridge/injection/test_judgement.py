@@ -200,6 +200,9 @@ class Switch(SourceSwitch):
         commander: Any = SimpleNamespace(send=lambda _, __, number: self._sent.append(number))
         super().__init__(config, commander, StatusNotifier(self.told.append), Counter())
 
+    def told_of(self, of: AlertId) -> list[tuple[Any, ...]]:
+        return [told.values for told in self.told if told.id is of]
+
     def drive(self, seconds: float, start: float = 0.0, **how: Any) -> list[tuple[float, int]]:
         """Decide ten times a second; times and sets of the orders. how: see the body."""
         orders = []
@@ -238,7 +241,7 @@ def test_bad_gnss_switches_once_to_vision(how: dict[str, Any], reason: str) -> N
     assert switch.drive(5.0) == []
     orders = switch.drive(6.0, 5.0, **how)
     assert orders == [(pytest.approx(6.5, abs=0.15), 2)]
-    assert [a.values[:2] for a in switch.told] == [(2, reason)]
+    assert [values[:2] for values in switch.told_of(AlertId.SOURCE_SET_SELECTED)] == [(2, reason)]
     assert switch.current == 2
 
 
@@ -265,7 +268,7 @@ def test_what_switches_nothing(config: SourceSwitchConfig, how: dict[str, Any]) 
 def test_a_receiver_that_claims_to_be_bad_hides_nothing() -> None:
     switch = Switch()
     switch.drive(5.0, north=60.0, claimed=12.0)
-    assert [a.values[1] for a in switch.told] == ["GNSS off vision"]
+    assert [why for _, why, _ in switch.told_of(AlertId.SOURCE_SET_SELECTED)] == ["GNSS off vision"]
 
 
 def test_back_to_gnss_only_if_configured_and_once_it_was_compared() -> None:
@@ -295,7 +298,7 @@ def test_no_return_to_a_far_receiver_of_which_nobody_says_that_it_is_bad() -> No
 def test_no_switch_without_a_go_of_the_shadow_score() -> None:
     switch = Switch()
     assert switch.drive(10.0, proven=False, gps=False) == []
-    assert {a.values[2] for a in switch.told} == {"not ready"}
+    assert {why for *_, why in switch.told_of(AlertId.SOURCE_SET_HELD)} == {"not ready"}
 
 
 def test_back_to_sound_gnss_once_vision_is_gone() -> None:
