@@ -41,14 +41,14 @@ def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
     return it
 
 
-def test_five_minutes_without_a_link(flight: Flight) -> None:
+def test_two_minutes_without_a_link(flight: Flight) -> None:
     """The localizer jumps meanwhile: the first message after it carries the jump and says so."""
     before = flight.vision()[-1][1]
     assert before.reset_counter == 0
     flight.link.open = False
-    flight.run(100.0)
+    flight.run(40.0)
     flight.north_m, flight.ekf_north_m, flight.reset_count = 25.0, 25.0, 1
-    flight.run(200.0)
+    flight.run(80.0)
     lost_ns = flight.now_ns
     assert flight.longest() <= 512
     flight.link.open = True
@@ -175,12 +175,12 @@ def test_a_latency_text_never_names_a_figure_within_its_limit(monkeypatch):
 def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer at its limit is late and in time by turns: three texts a minute say no more."""
     flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=100))
-    for latency_ms in (120, 80, 120, 80, 120, 80, 120):
+    for latency_ms in (120, 80, 120, 80, 120):
         flight.latency_ms = latency_ms
         flight.run(8.0)
     assert len(flight.told(*LATE)) == 1
     flight.latency_ms = 80
-    flight.run(90.0)
+    flight.run(30.0)
     assert flight.alerts[-1].id is AlertId.FIXES_IN_TIME
 
 
@@ -221,10 +221,9 @@ def damage(rng: random.Random, share: float) -> Callable[[bytes], bytes]:
     return mangle
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_damaged_frames_on_the_flight_controllers_link(monkeypatch, seed):
+def test_damaged_frames_on_the_flight_controllers_link(monkeypatch):
     flight = Flight(monkeypatch)
-    flight.mangle = damage(random.Random(seed), 0.3)
+    flight.mangle = damage(random.Random(0), 0.3)
     flight.run(90.0)
     counters = flight.reader.counters
     assert counters.bad_bytes > 1000
@@ -247,10 +246,9 @@ def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
         yield from reader.feed(frame_of(kind, rng.randbytes(kind.unpacker.size), *sender))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight, seed):
+def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight):
     ground, link = GroundEnd(flight.shared), SimulatedLink(system_id=1)
-    for i, message in enumerate(nonsense(random.Random(seed), 4000)):
+    for i, message in enumerate(nonsense(random.Random(0), 4000)):
         flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
         ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
         if i % 40 == 0:
@@ -266,7 +264,7 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight,
     assert math.isfinite(at.yaw_rad)
 
 
-@pytest.mark.parametrize("jumps", [1, 2, 3])
+@pytest.mark.parametrize("jumps", [1, 2])
 def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(monkeypatch, jumps):
     """Each process begins with a jump and counted from 0: ArduPilot had seen a 1 last, and fought
     the place that was found after the gap.

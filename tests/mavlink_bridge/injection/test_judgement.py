@@ -239,8 +239,9 @@ class Switch(SourceSwitch):
 def test_bad_gnss_switches_once_to_vision(how: dict[str, Any], reason: str) -> None:
     switch = Switch()
     assert switch.drive(5.0) == []
-    orders = switch.drive(6.0, 5.0, **how)
-    assert orders == [(pytest.approx(6.5, abs=0.15), 2)]
+    ((ordered_s, source_set),) = switch.drive(6.0, 5.0, **how)
+    assert ordered_s == pytest.approx(6.5, abs=0.15)
+    assert source_set == 2
     assert [values[:2] for values in switch.told_of(AlertId.SOURCE_SET_SELECTED)] == [(2, reason)]
     assert switch.current == 2
 
