@@ -37,7 +37,9 @@ def image(seed: int, width: int = 64, height: int = 48) -> np.ndarray:
         (True, None, False),
     ],
 )
-def test_it_is_used_where_the_processor_computes_in_bfloat16(installed, text, wanted, tmp_path, monkeypatch):
+def test_it_is_used_where_the_processor_has_bfloat16(
+    installed, text, wanted, tmp_path, monkeypatch
+):
     spec = ModuleSpec("openvino", None) if installed else None
     monkeypatch.setattr("importlib.util.find_spec", lambda _: spec)
     file = tmp_path / "cpuinfo"
