@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from mavlink_bridge.messages import VisionFix, horizontal_sigma_m
@@ -74,8 +75,7 @@ class FixPropagator:
     def __init__(self, acceleration_sigma_mps2: float, sigma_floor_m: float) -> None:
         self._acceleration = acceleration_sigma_mps2
         self._floor = np.eye(3) * sigma_floor_m**2
-        self._x: Array = np.zeros(6)  # position and velocity, NED from the anchor
-        self._P: Array = np.zeros((6, 6))
+        self._filter: KalmanFilter | None = None
         self._anchor = (0.0, 0.0)
         self._fix: VisionFix | None = None
 
@@ -89,35 +89,31 @@ class FixPropagator:
         R = fix.position_covariance_ned + self._floor
         last, self._fix = self._fix, fix
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
-        if last is None or gap_s > _FORGET_AFTER_S:
-            self._anchor = (fix.latitude_deg, fix.longitude_deg)
-            self._x = np.zeros(6)
-            self._P = np.diag([0.0] * 3 + [_UNKNOWN_SPEED_MPS**2] * 3)
-            self._set_position(fix, R)
+        if last is None or self._filter is None or gap_s > _FORGET_AFTER_S:
+            self._start(fix, R)
             return
         F, Q = self._motion(gap_s)
-        x, P = F @ self._x, F @ self._P @ F.T + Q
+        self._filter.predict(F=F, Q=Q)
+        z = self._ned(fix)
         if fix.reset_count != last.reset_count:
             # The estimate jumped, the aircraft did not: keep the velocity, take the position.
-            self._x, self._P = x, P
-            self._set_position(fix, R)
-            return
-        H = np.eye(3, 6)
-        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-        self._x = x + K @ (self._ned(fix) - H @ x)
-        I_KH = np.eye(6) - K @ H
-        self._P = I_KH @ P @ I_KH.T + K @ R @ K.T  # Joseph's form stays symmetric
+            self._filter.x[:3, 0] = z
+            self._filter.P[:3, :] = 0.0
+            self._filter.P[:, :3] = 0.0
+            self._filter.P[:3, :3] = R
+        else:
+            self._filter.update(z, R=R)
 
     def at(self, time_ns: int) -> PropagatedFix | None:
         """The newest fix propagated to `time_ns`; None before the first."""
-        fix = self._fix
-        if fix is None:
+        fix, kalman = self._fix, self._filter
+        if fix is None or kalman is None:
             return None
         dt = (time_ns - fix.time_ns) * 1e-9
         if fix.velocity_ned is not None:
             velocity, Pv = np.array(fix.velocity_ned), np.eye(3) * fix.velocity_sigma_mps**2
         else:
-            velocity, Pv = self._x[3:].copy(), self._P[3:, 3:]
+            velocity, Pv = kalman.x[3:, 0].copy(), kalman.P[3:, 3:].copy()
         north, east, down = velocity * dt
         latitude, longitude = offset(fix.latitude_deg, fix.longitude_deg, north, east)
         q = self._acceleration**2
@@ -132,11 +128,15 @@ class FixPropagator:
             Pv + np.eye(3) * q * dt**2,
         )
 
-    def _set_position(self, fix: VisionFix, R: Array) -> None:
-        """Replace the position by the fix's, and forget how it was related to the velocity."""
-        self._x[:3] = self._ned(fix)
-        self._P[:3, :] = self._P[:, :3] = 0.0
-        self._P[:3, :3] = R
+    def _start(self, fix: VisionFix, R: Array) -> None:
+        self._anchor = (fix.latitude_deg, fix.longitude_deg)
+        kalman = KalmanFilter(dim_x=6, dim_z=3)
+        kalman.x = np.zeros((6, 1))
+        kalman.x[:3, 0] = self._ned(fix)
+        kalman.P = np.diag([0.0] * 3 + [_UNKNOWN_SPEED_MPS**2] * 3)
+        kalman.P[:3, :3] = R
+        kalman.H = np.hstack([np.eye(3), np.zeros((3, 3))])
+        self._filter = kalman
 
     def _ned(self, fix: VisionFix) -> Array:
         north, east = north_east(*self._anchor, fix.latitude_deg, fix.longitude_deg)
