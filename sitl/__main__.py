@@ -39,8 +39,7 @@ from sitl.demo.scenario import (
     named_scenario,
     scenario_names,
 )
-from sitl.demo.script import FlightError
-from sitl.errors import SimulationError
+from sitl.errors import FlightError, SimulationError
 from sitl.operator.follow_run import fly_follows
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases

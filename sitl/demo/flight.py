@@ -29,16 +29,15 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.budget import FlightErrors, draw_errors
 from sitl.demo.companion_process import (
     THIS_PROGRAM,
+    FlightCompanion,
     Ports,
     free_udp_port,
-    running_companion,
-    wait_for_console,
     write_deployment,
 )
 from sitl.demo.scenario import Scenario, VehicleChoice
-from sitl.demo.script import FlightError, FlightScript, Progress
+from sitl.demo.script import FlightScript, Progress
 from sitl.demo.targets import observed_targets
-from sitl.errors import SimulationError
+from sitl.errors import FlightError, SimulationError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import (
@@ -132,10 +131,11 @@ def fly(
         stack.enter_context(truth_feed(pilot, camera, cache, gimbal_error, errors.map_shift_m))
         progress("starting the companion", 0.0)
         begun_ns, broken = time.monotonic_ns(), None
-        companion = stack.enter_context(running_companion(config, folder, program=program))
-        if ports.console is not None and wait_for_console(ports.console, companion):
+        companion = FlightCompanion(config, folder, stack, program=program)
+        companion.start()
+        if ports.console is not None and companion.serves(ports.console):
             observers.on_console(f"http://127.0.0.1:{ports.console}/")
-        run = FlightScript(pilot, scenario, home, folder, companion, progress)
+        run = FlightScript(pilot, scenario, home, companion, progress)
         try:
             denied_ns = run.fly()
         except SimulationError as error:

@@ -12,9 +12,9 @@ import numpy as np
 
 from mavlink_bridge.alerts.catalogue import spec_of
 from mavlink_bridge.alerts.ids import AlertId
+from sitl.demo.companion_process import Health
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop.case import Expectation
-from sitl.suite.loop.companion import Health
 from sitl.suite.record import Text
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat

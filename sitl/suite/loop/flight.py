@@ -24,14 +24,19 @@ from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
 from sitl.camera.zoom import ReportingCamera, Zooming
 from sitl.demo.assets import FlightAssets
-from sitl.demo.companion_process import Ports, free_udp_port, write_deployment
+from sitl.demo.companion_process import (
+    FlightCompanion,
+    Health,
+    Ports,
+    free_udp_port,
+    write_deployment,
+)
 from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
 from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
-from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import CpuLoad
 from sitl.suite.loop.evaluation import LoopRecord, LoopSample, RestartTimes, standing_alerts
 from sitl.suite.loop.terrain_file import terrain_file
@@ -129,7 +134,9 @@ class _LoopFlight:
         with self._pilot.fast_forward():
             self._pilot.wait_ready()
         config = self._write_deployment(vehicle)
-        self._companion = LoopCompanion(config, self._out, self._stack, supervised=case.supervised)
+        self._companion = FlightCompanion(
+            config, self._out, self._stack, supervised=case.supervised
+        )
         if not case.cold:
             self._companion.start()  # a processor for each while both load their programs
         self._open_camera()

@@ -16,13 +16,12 @@ from mavlink_bridge.alerts.catalogue import cleared as cleared_alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Output
 from sitl.__main__ import app
+from sitl.demo.companion_process import FlightCompanion
 from sitl.demo.scenario import ScenarioError
-from sitl.demo.script import FlightError
-from sitl.errors import SimulationError
+from sitl.errors import FlightError, SimulationError
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop import runner
 from sitl.suite.loop.case import Expectation, LoopCase, load_loop_cases
-from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.evaluation import (
     LoopExpectationResult,
     LoopRecord,
@@ -306,6 +305,6 @@ def test_the_shipped_flights_hold_together(tmp_path: Path) -> None:
 def test_no_signal_is_sent_before_the_flight_process_has_reported(tmp_path, signal):
     """Without a report its number is 0, and signals to 0 end the caller and its siblings."""
     with ExitStack() as stack:
-        companion = LoopCompanion(tmp_path / "companion.yaml", tmp_path, stack, supervised=True)
+        companion = FlightCompanion(tmp_path / "companion.yaml", tmp_path, stack, supervised=True)
         with pytest.raises(FlightError, match="no health report"):
             getattr(companion, signal)()
