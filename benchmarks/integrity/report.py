@@ -46,9 +46,6 @@ def acceptances(config: IntegrityConfig) -> dict[str, Acceptance]:
 
     return {
         WITHOUT: plain,
-        "second mode 5 % worse": lambda o: plain(o) and o.lead >= 0.05,
-        "quality 0.3": lambda o: plain(o) and o.quality >= 0.3,
-        "peak 4.5": lambda o: plain(o) and o.peak >= 4.5,
         LIKELY: likely,
         DISTINCT: by_prior,
         FOCAL: lambda o: likely(o) and focal(o),

@@ -31,7 +31,7 @@ from sitl.demo.companion_process import (
     free_udp_port,
     write_deployment,
 )
-from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
+from sitl.demo.flight import camera_config, home_of, vehicle_parameters
 from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
@@ -251,8 +251,9 @@ class _LoopFlight:
         )
         if self._participant is not None:
             self._movers += self._participant.movers(epoch_ns)
-        filmed = FilmedFlight(world, case.scenario, self._ports, self._seed, self._movers)
-        config = camera_config(filmed, self._out)
+        config = camera_config(
+            world, case.scenario, self._ports, self._seed, self._out, self._movers
+        )
         self._camera = WorldCameraProcess(config)
         self._stack.enter_context(self._camera)
         fault = np.radians(case.wrong.gimbal_deg)

@@ -295,9 +295,9 @@ def test_the_shipped_flights_hold_together(tmp_path: Path) -> None:
     assert len(normal) >= 6
     assert all(case.name.startswith("normal") for case in normal)
     assert all(case.expect.silent for case in normal)
-    with pytest.raises(ScenarioError, match="holds no flights"):
+    with pytest.raises(ScenarioError, match="holds no scenario files"):
         load_loop_cases(folder=tmp_path / "nowhere")
-    with pytest.raises(ScenarioError, match="no nowhere"):
+    with pytest.raises(ScenarioError, match="no scenario nowhere"):
         load_loop_cases(["nowhere"])
 
 
