@@ -59,18 +59,6 @@ class LoopAssets:
     wrong_map: Path | None = None
 
 
-@dataclass(frozen=True)
-class ParticipantContext:
-    """The flight for a `FlightParticipant`. frames: path of the world camera's log; movers: all
-    moving objects, map ENU.
-    """
-
-    vehicle: VehicleProcess
-    pilot: Pilot
-    frames: Path
-    movers: tuple[Mover, ...]
-
-
 class FlightParticipant(Protocol):
     """Code that takes part in a flight, for example a simulated operator or pilot."""
 
@@ -78,8 +66,12 @@ class FlightParticipant(Protocol):
         """Additional moving objects in the world; epoch_ns: CLOCK_MONOTONIC."""
         ...
 
-    def take_part(self, context: ParticipantContext) -> AbstractContextManager[None]:
-        """Context manager around the recorded part: entered at its start, left at its end."""
+    def take_part(
+        self, vehicle: VehicleProcess, pilot: Pilot, frames: Path
+    ) -> AbstractContextManager[None]:
+        """Context manager around the recorded part: entered at its start, left at its end. frames:
+        the world camera's log.
+        """
         ...
 
 
@@ -110,7 +102,6 @@ class _LoopFlight:
     ) -> None:  # fmt: skip
         self._case, self._assets, self._kind = case, assets, kind
         self._participant = participant
-        self._movers: tuple[Mover, ...] = ()
         self._seed, self._out, self._stack = seed, out, stack
         self._home = home_of(assets.world)
         self._samples: list[LoopSample] = []
@@ -246,14 +237,12 @@ class _LoopFlight:
         case, world = self._case, self._assets.world
         cache = TileCache.open(world.map_cache)
         epoch_ns = time.monotonic_ns()
-        self._movers = traffic(
+        movers = traffic(
             world.world, cache.frame, cars=3, people=3, seed=self._seed, epoch_ns=epoch_ns
         )
         if self._participant is not None:
-            self._movers += self._participant.movers(epoch_ns)
-        config = camera_config(
-            world, case.scenario, self._ports, self._seed, self._out, self._movers
-        )
+            movers += self._participant.movers(epoch_ns)
+        config = camera_config(world, case.scenario, self._ports, self._seed, self._out, movers)
         self._camera = WorldCameraProcess(config)
         self._stack.enter_context(self._camera)
         fault = np.radians(case.wrong.gimbal_deg)
@@ -267,8 +256,7 @@ class _LoopFlight:
         if self._participant is None:
             return nullcontext()
         frames = self._out / "frames.csv"
-        context = ParticipantContext(self._vehicle, self._pilot, frames, self._movers)
-        return self._participant.take_part(context)
+        return self._participant.take_part(self._vehicle, self._pilot, frames)
 
     @property
     def _now_s(self) -> float:
