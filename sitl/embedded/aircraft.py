@@ -7,7 +7,7 @@ from math import cos, exp, radians, sin, sqrt
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded.control.arming import GYRO_SETTLE_S, arming_failures
+from sitl.embedded.control.arming import GYRO_SETTLE_S, ArmingContext, arming_failures
 from sitl.embedded.control.loop import advance
 from sitl.embedded.control.mission import MissionStore
 from sitl.embedded.control.modes import FlightModes
@@ -233,7 +233,20 @@ class Aircraft:
         if isinstance(self.modes, Px4Modes):
             settled = self.time_s >= GYRO_SETTLE_S and self.modes.position_ok
             return [] if settled else ["no valid global position"]
-        return arming_failures(self)
+        return arming_failures(
+            ArmingContext(
+                self.time_s,
+                self.parameters,
+                self.estimator,
+                self.modes.mode.name,
+                self.modes.mode.armable,
+                self.modes.mode.needs_position,
+                self.modes.home is not None,
+                self.gps_has_fix,
+                self.gps_healthy,
+                self.injection.healthy(self.time_ms),
+            )
+        )
 
     def report_failures(self, prefix: str) -> bool:
         """Send each failing arming check as a STATUSTEXT after `prefix`; True if there are any."""

@@ -2,60 +2,74 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 from sitl.embedded.ekf.aided_filter import EXTERNAL, GPS
-
-if TYPE_CHECKING:
-    from sitl.embedded.aircraft import Aircraft
+from sitl.embedded.ekf.estimator import Estimator
+from sitl.embedded.parameters import Parameters
 
 _ALL, _GPS_CHECK, _INS, _VISION = 1, 1 << 3, 1 << 4, 1 << 18  # ARMING_CHECK
 GYRO_SETTLE_S = 25.0  # as measured on ArduPilot SITL
 
 
-def arming_failures(vehicle: Aircraft) -> list[str]:
+@dataclass(frozen=True)
+class ArmingContext:
+    """Vehicle state that the pre-arm checks use."""
+
+    time_s: float
+    parameters: Parameters
+    estimator: Estimator
+    mode_name: str
+    mode_armable: bool
+    needs_position: bool
+    home_set: bool
+    gps_fix: bool
+    gps_healthy: bool
+    vision_healthy: bool
+
+
+def arming_failures(context: ArmingContext) -> list[str]:
     """The texts of all arming checks that fail, as ArduPilot words them; an empty list if the
     vehicle may arm.
     """
-    failures = _optional(vehicle) + _mandatory(vehicle)
-    if not vehicle.modes.mode.armable:
-        failures.append(f"{vehicle.modes.mode.name} mode not armable")
+    failures = _optional(context) + _mandatory(context)
+    if not context.mode_armable:
+        failures.append(f"{context.mode_name} mode not armable")
     return failures
 
 
-def _optional(v: Aircraft) -> list[str]:
+def _optional(c: ArmingContext) -> list[str]:
     failures = []
-    if _enabled(v, _INS) and v.time_s < GYRO_SETTLE_S:
+    if _enabled(c, _INS) and c.time_s < GYRO_SETTLE_S:
         failures.append("Gyros inconsistent")
-    if _enabled(v, _GPS_CHECK):
-        if v.parameters["GPS1_TYPE"] > 0 and not v.gps_has_fix:
+    if _enabled(c, _GPS_CHECK):
+        if c.parameters["GPS1_TYPE"] > 0 and not c.gps_fix:
             failures.append("GPS 1: Bad fix")
-        elif v.parameters["GPS1_TYPE"] > 0 and not v.gps_healthy:
+        elif c.parameters["GPS1_TYPE"] > 0 and not c.gps_healthy:
             failures.append("GPS 1: not healthy")
-        elif v.modes.home is None:
+        elif not c.home_set:
             failures.append("AHRS: waiting for home")
-    visual = v.parameters["VISO_TYPE"] > 0
-    if _enabled(v, _VISION) and visual and not v.injection.healthy(v.time_ms):
+    if _enabled(c, _VISION) and c.parameters["VISO_TYPE"] > 0 and not c.vision_healthy:
         failures.append("VisOdom: not healthy")
     return failures
 
 
-def _enabled(v: Aircraft, check: int) -> bool:
-    return bool(int(v.parameters["ARMING_CHECK"]) & (_ALL | check))
+def _enabled(c: ArmingContext, check: int) -> bool:
+    return bool(int(c.parameters["ARMING_CHECK"]) & (_ALL | check))
 
 
-def _mandatory(v: Aircraft) -> list[str]:
-    sources = _source_failure(v)
+def _mandatory(c: ArmingContext) -> list[str]:
+    sources = _source_failure(c)
     if sources:
         return [f"AHRS: {sources}"]
-    if not v.modes.mode.needs_position:
+    if not c.needs_position:
         return []
-    if not v.estimator.position_valid:
+    if not c.estimator.position_valid:
         return ["Need Position Estimate"]
-    if v.estimator.gps_glitching:
+    if c.estimator.gps_glitching:
         return ["GPS glitching"]
-    limit = v.parameters["FS_EKF_THRESH"]
-    velocity, position, height, compass = v.estimator.variances
+    limit = c.parameters["FS_EKF_THRESH"]
+    velocity, position, height, compass = c.estimator.variances
     named = (
         ("compass", compass),
         ("position", position),
@@ -65,17 +79,17 @@ def _mandatory(v: Aircraft) -> list[str]:
     return [f"EKF {name} variance" for name, value in named if 0 < limit <= value][:1]
 
 
-def _source_failure(v: Aircraft) -> str | None:
+def _source_failure(c: ArmingContext) -> str | None:
     """EKF3's check that every configured source has its sensor."""
     position = [
-        int(v.parameters[f"EK3_SRC{n}_{what}"])
+        int(c.parameters[f"EK3_SRC{n}_{what}"])
         for n in (1, 2, 3)
         for what in ("POSXY", "VELXY", "POSZ", "VELZ")
-        if v.modes.mode.needs_position
+        if c.needs_position
     ]
-    yaw = [int(v.parameters[f"EK3_SRC{n}_YAW"]) for n in (1, 2, 3)]
-    if GPS in position and v.parameters["GPS1_TYPE"] == 0:
+    yaw = [int(c.parameters[f"EK3_SRC{n}_YAW"]) for n in (1, 2, 3)]
+    if GPS in position and c.parameters["GPS1_TYPE"] == 0:
         return "EK3 sources require GPS"
-    if EXTERNAL in position + yaw and v.parameters["VISO_TYPE"] == 0:
+    if EXTERNAL in position + yaw and c.parameters["VISO_TYPE"] == 0:
         return "EK3 sources require VisualOdom"
     return None
