@@ -46,7 +46,7 @@ def main() -> None:
     args = parser().parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     path = args.folder / "draws.jsonl"
-    rows = read_lines(path)
+    rows = read_lines(path) if path.exists() else []
     if not args.report:
         more_time = deadline(args.minutes)
         assets = prepare(args.world)

@@ -139,7 +139,7 @@ class LegFlyer:
 def run_world(assets: FlightAssets, count: int, path: Path, more_time: Callable[[], bool]) -> int:
     """Append the legs of a world that `path` lacks; how many are left."""
     world = f"{assets.world.seed}"
-    done = {f.leg for f in read(path) if f.world == world}
+    done = {f.leg for f in read(path) if f.world == world} if path.exists() else set()
     legs = draw_legs(
         assets.world.seed,
         assets.world.size_m,
