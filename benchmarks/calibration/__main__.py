@@ -63,7 +63,7 @@ def main() -> None:
                 with path.open("a") as file:
                     file.write(json.dumps(row) + "\n")
             print(f"draw {seed}: done, {len(left)} left", flush=True)
-        rows = read_lines(path)
+        rows = read_lines(path) if path.exists() else []
     if rows:
         made = summary(rows)
         print(f"{made['draws']} draws")
