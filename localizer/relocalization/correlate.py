@@ -97,8 +97,9 @@ class LevelCorrelator:
         self._most = max(1, byte_budget // one)
         self._kept: OrderedDict[Block, _Spectra] = OrderedDict()
         self._lock = threading.Lock()
-        # int8 squares summed as such would wrap.
-        sample = level.features[:, ::4, ::4].astype(np.float32) * level.quantum
+        # Row by row, which may be in a file; int8 squares summed as such would wrap.
+        rows = [level.features[:, r : r + 1, ::4] for r in range(0, level.shape[0], 4)]
+        sample = np.concatenate(rows, axis=1).astype(np.float32) * level.quantum
         energy = (sample**2).sum(axis=0)
         self._usual = float(energy[energy > 0].mean()) if (energy > 0).any() else 1.0
 
