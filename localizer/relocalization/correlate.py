@@ -58,8 +58,9 @@ class _Spectra:
 
 @dataclass(frozen=True)
 class PatchSpectra:
-    """A patch's Fourier transform. features: (K, 2 _LOW, _LOW+1); mask: as `_Spectra.energy`; norm:
-    root of its energy; cells: side of the patch; weight: share of cells in view.
+    """A patch's Fourier transform. features: (K, 2 _LOW, SIZE / apart / 2 + 1); mask: as
+    `_Spectra.energy`; norm: root of its energy; cells: side of the patch; weight: share of cells in
+    view.
     """
 
     features: Complex64
@@ -69,12 +70,14 @@ class PatchSpectra:
     weight: float
 
 
-def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
-    """Transform a patch. features: (n, n, K) weighted; mask: (n, n) in [0, 1]."""
+def transform_patch(features: Float32, mask: Float32, apart: int = ORIGIN_CELLS) -> PatchSpectra:
+    """Transform a patch, to compare it at every `apart`th origin or less often. features: (n, n, K)
+    weighted; mask: (n, n) in [0, 1].
+    """
     n = features.shape[0]
     some = features[::ORIGIN_CELLS, ::ORIGIN_CELLS].transpose(2, 0, 1)
     # Row by row first: most rows are empty and stay so.
-    lines = scipy.fft.rfft(some, 2 * _LOW, axis=2, workers=1)
+    lines = scipy.fft.rfft(some, 2 * _LOW, axis=2, workers=1)[..., : SIZE // apart // 2 + 1]
     spectra = scipy.fft.fft(lines, 2 * _LOW, axis=1, workers=1)
     sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
     coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)

@@ -324,7 +324,7 @@ class _MapSearch:
             return []
         wanted = [trial.blocks for trial in trials]
         rough: list[tuple[int, float, float, Block]] = []
-        if sum(map(len, wanted)) > _MOST_PAIRS:
+        if sum(map(len, wanted)) > 2 * _MOST_PAIRS:  # a rough pass takes half of the time
             rough = [
                 (p.trial, p.power, float(p.scores.max()), p.block)
                 for p in self.compare(looks, wanted, ROUGH_CELLS, each)
@@ -390,7 +390,9 @@ class _MapSearch:
             if not blocks:
                 continue
             patches = [
-                transform_patch(*(fitted(x, look.of, t.of) for x in (look.features, look.mask)))
+                transform_patch(
+                    fitted(look.features, look.of, t.of), fitted(look.mask, look.of, t.of), apart
+                )
                 for t in some
             ]
             for k in range(0, len(blocks), BLOCKS_TOGETHER):
