@@ -324,7 +324,7 @@ class _MapSearch:
             return []
         wanted = [trial.blocks for trial in trials]
         rough: list[tuple[int, float, float, Block]] = []
-        if sum(map(len, wanted)) > 2 * _MOST_PAIRS:  # a rough pass takes half of the time
+        if sum(map(len, wanted)) > 4 * _MOST_PAIRS:  # below, a rough pass saves nothing
             rough = [
                 (p.trial, p.power, float(p.scores.max()), p.block)
                 for p in self.compare(looks, wanted, ROUGH_CELLS, each)
