@@ -316,7 +316,7 @@ def test_a_map_that_is_only_read_is_searched_all_the_same(cache, opened, monkeyp
 
 
 def test_a_map_whose_search_does_not_fit_into_memory_is_named(cache, opened, monkeypatch):
-    monkeypatch.setattr("localizer.relocalization.overview.available_bytes", lambda: 1 << 20)
+    monkeypatch.setattr("localizer.relocalization.overview.available_bytes", lambda: 1 << 16)
     with pytest.raises(MapCacheError, match=r"search of .* km² takes \d+ MiB, more than half of"):
         open_relocalizer(cache, CONFIG)
     monkeypatch.setattr("localizer.relocalization.overview.available_bytes", lambda: None)
