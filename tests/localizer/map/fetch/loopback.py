@@ -1,4 +1,4 @@
-"""A small world on disk, and servers of it on loopback: files by ranges, tiles, WMS and WCS.
+"""A small world on disk, and servers of it on loopback: files by ranges, tiles, MapServer.
 
 Nothing here or in the tests goes beyond this machine.
 """
@@ -6,6 +6,8 @@ Nothing here or in the tests goes beyond this machine.
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import threading
 import time
 from contextlib import contextmanager
@@ -18,15 +20,14 @@ import cv2
 import numpy as np
 import rasterio
 from pyproj import Transformer
-from rasterio.io import MemoryFile
-from rasterio.transform import from_bounds, from_origin
-from rasterio.vrt import WarpedVRT
+from rasterio.transform import from_origin
 from rasterio.warp import Resampling, reproject
 
 CRS = "EPSG:32632"
 LEFT, TOP = 462_000.0, 5_250_400.0
 SIDE_M = 400
 STEP_M, TEXEL_M = 1.0, 0.5
+MAPSERV = "/usr/lib/cgi-bin/mapserv"
 
 
 def height_m(east, north):
@@ -168,7 +169,7 @@ class _QuietServer(ThreadingHTTPServer):
 
 @contextmanager
 def serving(folder: Path):
-    """The folder, its tiles and its web services."""
+    """The folder, its tiles and MapServer over its map file."""
     served = Served(folder)
 
     class Handler(BaseHTTPRequestHandler):
@@ -184,9 +185,8 @@ def serving(folder: Path):
                 self._send(status, b"busy", headers)
                 return
             parts = urlsplit(self.path)
-            if parts.path == "/ows":
-                kind, body = web_service(served.folder, parse_qsl(parts.query))
-                self._send(200, body, {"Content-Type": kind})
+            if parts.path == "/mapserv":
+                self._mapserver(parts.query)
             elif parts.path.startswith(("/tiles/", "/tms/")):
                 self._tile(parts.path)
             elif parts.path.startswith("/api"):
@@ -202,6 +202,20 @@ def serving(folder: Path):
         def _search(self, path: str, query: dict[str, str] | None, posted: Any = None) -> None:
             document = served.catalogue.answer(served.url, path, query, posted)
             self._send(405 if document is None else 200, json.dumps(document or {}).encode())
+
+        def _mapserver(self, query: str) -> None:
+            environment = os.environ | {
+                "REQUEST_METHOD": "GET", "QUERY_STRING": query,
+                "MS_MAPFILE": str(served.folder / "world.map"),
+                "MAPSERVER_CONFIG_FILE": str(served.folder / "mapserver.conf"),
+            }  # fmt: skip
+            done = subprocess.run([MAPSERV], env=environment, capture_output=True, check=False)
+            head, _, body = done.stdout.partition(b"\r\n\r\n")
+            kind = "text/plain"
+            for line in head.decode("latin-1").splitlines():
+                name, _, value = line.partition(":")
+                kind = value.strip() if name.lower() == "content-type" else kind
+            self._send(200, body, {"Content-Type": kind})
 
         def _tile(self, path: str) -> None:
             kind, z, x, y = path.strip("/").removesuffix(".png").split("/")
@@ -247,45 +261,49 @@ def serving(folder: Path):
         server.server_close()
 
 
-def web_service(folder: Path, query: list[tuple[str, str]]) -> tuple[str, bytes]:
-    """MIME type and body of a WMS 1.1.1 and 1.3.0 (OGC 06-042) or a WCS 1.0.0 and 2.0.1 (OGC
-    09-147r3) of the two rasters.
-    """
-    asked, subsets = dict(query), [value for name, value in query if name == "SUBSET"]
-    layer = next(asked[name] for name in ("LAYERS", "COVERAGE", "COVERAGEID") if name in asked)
-    if layer not in ("ortho", "surface"):
-        return (
-            "text/xml",
-            b"<ServiceException>Invalid layer(s) given</ServiceException>",
-        )
-    if asked["REQUEST"] == "DescribeCoverage":
-        return "text/xml", b'<g xmlns:a="b"><a:Envelope axisLabels="x y"/></g>'
-    crs = asked.get("CRS", asked.get("SRS", CRS))
-    if subsets:  # at the native resolution
-        (left, right), (bottom, top) = (
-            map(float, subset[2:-1].split(",")) for subset in sorted(subsets)
-        )
-        width, height = round((right - left) / STEP_M), round((top - bottom) / STEP_M)
-    else:
-        left, bottom, right, top = (float(v) for v in asked["BBOX"].split(","))
-        if asked["VERSION"] == "1.3.0" and crs == "EPSG:4326":  # latitude first
-            left, bottom, right, top = bottom, left, top, right
-        width, height = int(asked["WIDTH"]), int(asked["HEIGHT"])
-    place = {"crs": crs, "transform": from_bounds(left, bottom, right, top, width, height)}
-    with (
-        rasterio.open(folder / f"{layer}.tif") as data,
-        WarpedVRT(data, width=width, height=height, resampling=Resampling.bilinear, **place) as vrt,
-    ):
-        values = vrt.read()
-    if asked["SERVICE"] == "WMS":
-        rgb = np.ascontiguousarray(np.moveaxis(values[::-1], 0, -1))
-        return "image/png", cv2.imencode(".png", rgb)[1].tobytes()
-    with MemoryFile() as memory:
-        with memory.open(
-            driver="GTiff", width=width, height=height, count=1, dtype="float32", **place
-        ) as out:
-            out.write(values)
-        return "image/tiff", bytes(memory.read())
+def write_map_file(folder: Path, url: str) -> None:
+    """MapServer's: WMS and WCS of the two rasters."""
+    (folder / "mapserver.conf").write_text(
+        'CONFIG\n ENV\n MS_MAP_PATTERN "."\n PROJ_LIB "/usr/share/proj"\n END\nEND\n'
+    )
+    layers = "".join(
+        f"""
+  LAYER
+    NAME "{name}"
+    TYPE RASTER
+    STATUS ON
+    DATA "{folder / f"{name}.tif"}"
+    PROJECTION "init=epsg:32632" END
+    {'PROCESSING "RESAMPLE=BILINEAR"' if name == "ortho" else ""}
+    METADATA
+      "wms_title" "{name}" "wms_enable_request" "*"
+      "wcs_label" "{name}" "wcs_enable_request" "*" "wcs_rangeset_name" "bands"
+      "wcs_rangeset_label" "bands" "wcs_formats" "GTIFF32" "wcs_size" "400 400"
+      "wcs_extent" "{LEFT} {TOP - SIDE_M} {LEFT + SIDE_M} {TOP}" "wcs_resolution" "1 1"
+      "wcs_native_format" "image/tiff" "wcs_imagemode" "FLOAT32" "wcs_bandcount" "1"
+    END
+  END"""
+        for name in ("ortho", "surface")
+    )
+    (folder / "world.map").write_text(
+        f"""MAP
+  NAME "world"
+  EXTENT {LEFT} {TOP - SIDE_M} {LEFT + SIDE_M} {TOP}
+  SIZE 400 400
+  MAXSIZE 4096
+  PROJECTION "init=epsg:32632" END
+  OUTPUTFORMAT NAME "GTIFF32" DRIVER "GDAL/GTiff" MIMETYPE "image/tiff" IMAGEMODE FLOAT32
+    EXTENSION "tif" END
+  OUTPUTFORMAT NAME "png" DRIVER "AGG/PNG" MIMETYPE "image/png" IMAGEMODE RGB END
+  OUTPUTFORMAT NAME "jpeg" DRIVER "AGG/JPEG" MIMETYPE "image/jpeg" IMAGEMODE RGB
+    FORMATOPTION "QUALITY=95" END
+  WEB METADATA
+    "ows_title" "world" "ows_onlineresource" "{url}/mapserv?" "ows_enable_request" "*"
+    "ows_srs" "EPSG:32632 EPSG:4326 EPSG:3857 EPSG:25832"
+  END END{layers}
+END
+"""
+    )
 
 
 def write_stac(folder: Path, url: str) -> list[dict[str, Any]]:
