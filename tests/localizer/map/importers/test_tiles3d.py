@@ -16,6 +16,7 @@ from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.importers.gltf import read_gltf
 from localizer.map.importers.tiles3d import read_tileset
+from localizer.map.inspection.inspect import export_glb
 from tests.localizer.map.conftest import pack_glb, unpack_glb, write_tree
 
 
@@ -161,6 +162,7 @@ def test_missing_children_leave_the_parent_in_view(tmp_path, make, build):
     # The leaf's parent keeps its own surface: its other three children are left out.
     assert cache.manifest.tiles == 17
     assert int((cache.index.child_count == 0).sum()) == 13
+    assert export_glb(cache, tmp_path / "out.glb", level=2) == 13 * 128
 
 
 def test_the_geoid_separation_is_computed_and_compared(tmp_path, make):
