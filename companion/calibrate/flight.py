@@ -9,8 +9,15 @@ from functools import partial
 import numpy as np
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.autopilot_window import REACH_S, AutopilotWindow, autopilot_window_at
-from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, Guess, changed_camera
+from companion.calibrate.evidence import (
+    REACH_S,
+    AutopilotWindow,
+    CalibrationFrame,
+    CalibrationProblem,
+    Guess,
+    autopilot_window_at,
+    changed_camera,
+)
 from companion.calibrate.pictures import PictureReader
 from companion.calibrate.solve import Solution, solve
 from companion.config import CompanionConfig, FeedConfig

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from companion.calibrate.views import BoardView
+from companion.calibrate.board import BoardView
 from companion.errors import RecordError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array

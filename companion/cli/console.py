@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
+from companion.cli.output import tell
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.live.config import ConsoleConfig
@@ -74,10 +74,7 @@ def serve(site: ConsoleSite) -> None:
     """Serve the page until interrupted. Prints the address once the page can be opened."""
     from companion.console.serving import Server
 
-    def tell() -> None:
-        Console().print(f"console: [green]{site.config.url}[/]", soft_wrap=True, highlight=False)
-
-    server = Server(site, tell)
+    server = Server(site, lambda: tell(f"console: [green]{site.config.url}[/]"))
     with console_log(verbose=False):
         server.run()
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from localizer.geometry.pose import Array
-from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import (
     LastPosition,
     RefusalReason,
+    SharedBias,
     TargetRefusal,
     is_at_seen_depth,
     is_near_map_hole,

@@ -11,12 +11,13 @@ from stanag4609.klv.local_set import parse_local_set
 from stanag4609.st0601 import decode_uas_local_set
 
 from companion.klv import local_set as tag
-from companion.klv.local_set import checksum, encode
-from companion.klv.universal_set import (
+from companion.klv.local_set import (
     ANGLE_TO_NORTH,
     OBLIQUITY,
     UNIVERSAL_SET_LABEL,
+    checksum,
     decode_universal,
+    encode,
 )
 from companion.recorded.klv_video import decode, read_klv, read_klv_packets
 

@@ -11,12 +11,12 @@ from companion.targets.detections import (
     Detection,
     DetectionListener,
     FrameName,
+    Senders,
     encode_detection,
     parse_detection,
     parse_host_port,
 )
 from companion.targets.frame_times import FrameTimes
-from companion.targets.senders import Senders
 from localizer.geometry.camera import Camera
 from localizer.types import Frame
 

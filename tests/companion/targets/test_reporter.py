@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from companion.config import TargetConfig
-from companion.targets.clicks import ClickPolicy
-from companion.targets.detections import Detection
-from companion.targets.history import PoseHistory
-from companion.targets.numbers import TargetNumbers
+from companion.targets.clicks import ClickPolicy, PoseHistory
+from companion.targets.detections import Detection, TargetNumbers
 from companion.targets.pictures import RecentPictures
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
