@@ -84,14 +84,6 @@ def _write_poses(path: Path, poses: Sequence[StampedPose], place: MapReference) 
     write_poses(path, (pose_row(p.name, p.world_from_camera, place.frame) for p in poses))
 
 
-def _read_tum(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    return read_tum(path)
-
-
-def _write_tum(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
-    write_tum(path, poses)
-
-
 def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     """Poses (camera from world) of an ``images.txt``, which has two lines an image. The second
     line, of points, may be missing, as in files of known poses that are written by hand.
@@ -220,26 +212,18 @@ def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     return poses
 
 
-def _read_photos(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    return read_photos(path, place.frame, place.heights, place.tell)
-
-
-def _write_photos(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
-    write_sidecars(path, poses, place.frame, place.heights)
-
-
 READERS: dict[str, Reader] = {
     "poses": _read_poses,
-    "tum": _read_tum,
+    "tum": lambda path, _: read_tum(path),
     "colmap": _read_colmap,
-    "photos": _read_photos,
+    "photos": lambda path, place: read_photos(path, place.frame, place.heights, place.tell),
     "autopilot": _read_autopilot,
     "record": _read_record,
 }
 WRITERS: dict[str, Writer] = {
     "poses": _write_poses,
-    "tum": _write_tum,
+    "tum": lambda path, poses, _: write_tum(path, poses),
     "colmap": _write_colmap,
-    "photos": _write_photos,
+    "photos": lambda path, poses, place: write_sidecars(path, poses, place.frame, place.heights),
     "autopilot": _write_autopilot,
 }

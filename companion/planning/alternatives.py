@@ -5,11 +5,11 @@ headings.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from companion.planning.survey import Progress, Surveyor, shifted_sample
+from companion.planning.survey import Progress, Surveyor
 from companion.planning.verdicts import LegVerdict, SampleVerdict
 from companion.planning.way import PathSample
 
@@ -32,6 +32,11 @@ class LegAlternative:
     pitch_deg: float
     turn_deg: float
     words: str
+
+    def applied(self, sample: PathSample) -> PathSample:
+        """The sample as it is flown then."""
+        position = sample.position + np.array([0.0, 0.0, self.rise_m])
+        return replace(sample, position=position, pitch_deg=self.pitch_deg, turn_deg=self.turn_deg)
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,7 @@ def leg_proposals(
             :_SAMPLES
         ]
         for change in alternatives_at(worst[0], fixed):
-            shift = (change.rise_m, change.pitch_deg, change.turn_deg)
-            samples = [shifted_sample(j.sample, *shift) for j in worst]
-            tried.append((verdict, change, samples))
+            tried.append((verdict, change, [change.applied(j.sample) for j in worst]))
     judged = iter(surveyor.verdicts([s for _, _, part in tried for s in part], progress))
     found: dict[str, LegProposal] = {}
     for verdict, change, samples in tried:

@@ -23,6 +23,7 @@ from localizer.geometry.pose import Array, matrix_from_euler, so3_exp, so3_log
 from localizer.types import Frame
 
 Kind = Literal["photos", "video", "sequence"]
+TILT_DEG, HEADING_DEG = 2.0, 6.0  # sigmas of a gimbal that is not calibrated, and of its compass
 
 
 class Datum(Enum):
@@ -53,6 +54,10 @@ class RecordedPosition:
     sigma_m: float
     heights: tuple[Height, ...] = ()
 
+    def height_m(self, datum: Datum) -> float | None:
+        """The recorded height above that surface; None without one."""
+        return next((h.value_m for h in self.heights if h.datum is datum), None)
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
@@ -72,8 +77,8 @@ class RecordedView:
         roll_deg: float,
         pitch_deg: float,
         yaw_deg: float,
-        tilt_sigma_deg: float,
-        heading_sigma_deg: float | None,
+        tilt_sigma_deg: float = TILT_DEG,
+        heading_sigma_deg: float | None = HEADING_DEG,
         *,
         measured: bool = True,
     ) -> RecordedView:

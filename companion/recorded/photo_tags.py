@@ -18,6 +18,7 @@ from PIL import ExifTags, Image
 
 from companion.errors import FootageError
 from companion.recorded.flight import (
+    HEADING_DEG,
     Datum,
     Height,
     RecordedPosition,
@@ -39,7 +40,6 @@ _ABSOLUTE_M = 30.0  # of DJI's altitude without RTK: barometer and model of the 
 _GNSS_HEIGHT_M = 8.0
 _BAROMETER_M, _BAROMETER_SHARE = 2.0, 0.02
 _LARGEST_SIGMA_M = 1e5  # as in a file of places
-_TILT_DEG, _HEADING_DEG = 2.0, 6.0  # of a gimbal that is not calibrated; of its compass
 _DOWN_DEG = 10.0  # of a camera of which nothing is said: survey photos look down
 
 
@@ -115,7 +115,7 @@ class PhotoTags:
             if len(values) == 3 and any(values):
                 roll, pitch, yaw = convert(values[0], values[1], values[2])
                 roll = -roll if self.maker == "sensefly" else roll  # positive to the left there
-                return RecordedView.of_angles(roll, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+                return RecordedView.of_angles(roll, pitch, yaw)
         return None
 
     @property
@@ -225,7 +225,7 @@ def looking_down(heading_deg: float | None) -> RecordedView:
 
     heading_deg: of the aircraft, None if unknown.
     """
-    sigma = None if heading_deg is None else 2.0 * _HEADING_DEG
+    sigma = None if heading_deg is None else 2.0 * HEADING_DEG
     return RecordedView.of_angles(0.0, -90.0, heading_deg or 0.0, _DOWN_DEG, sigma, measured=False)
 
 

@@ -37,7 +37,6 @@ _AUTEL = re.compile(
 _AUTEL_GIMBAL = re.compile(rf"G\.PRY\s*\(\s*{_NUMBER}.?\s*,\s*{_NUMBER}.?\s*,\s*{_NUMBER}")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m")
 _SIGMA_M, _ABSOLUTE_M, _BAROMETER_M, _SHARE = 3.0, 30.0, 2.0, 0.02
-_TILT_DEG, _HEADING_DEG = 2.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,10 @@ def _telemetry(body: str, pairs: dict[str, float], time_ns: int) -> Telemetry:
     gimbal = [pairs.get(f"gb_{name}") for name in ("roll", "pitch", "yaw")]
     told = [g for g in gimbal if g is not None]
     if len(told) == 3 and any(told):  # all zero: not measured
-        view = RecordedView.of_angles(told[0], told[1], told[2], _TILT_DEG, _HEADING_DEG)
+        view = RecordedView.of_angles(told[0], told[1], told[2])
     elif (found := _AUTEL_GIMBAL.search(body)) is not None:
         pitch, roll, yaw = (float(x) for x in found.groups())
-        view = RecordedView.of_angles(roll, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+        view = RecordedView.of_angles(roll, pitch, yaw)
     zoom = pairs.get("dzoom_ratio", 1.0)
     zoom = zoom / 10_000.0 if zoom >= 1000.0 else zoom
     return Telemetry(time_ns, position, view, None, zoom if zoom >= 1.0 else 1.0)

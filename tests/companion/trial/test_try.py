@@ -14,11 +14,12 @@ from companion.cli.commands import app
 from companion.config import load_config
 from companion.convert.angles import gimbal_of_pose
 from companion.errors import FootageError, ReportError
+from companion.planning.way import MapHeights
 from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer, Localized, height_bands, likely_height
-from companion.trial.priors import Ground, priors_of
+from companion.trial.priors import priors_of
 from companion.trial.result import Trial
 from companion.trial.run import evenly_spread, localize_each, localize_from_telemetry
 from localizer.config import LocalizerConfig
@@ -242,7 +243,7 @@ def test_a_map_with_heights_in_feet_is_named(small_assets, tmp_path, factor, tol
     """By the photos' two heights, whose difference is the ground's below the take-off."""
     cache = TileCache.open(small_assets.map_cache)
     middle = cache.frame.position(np.zeros(3))
-    height_m = Ground(cache).height(0.0, 0.0)
+    height_m = MapHeights(cache).height_m(0.0, 0.0)
     assert height_m is not None
     assert cache.manifest.geoid_separation_m is not None
     ground_m = height_m + middle.height_m - cache.manifest.geoid_separation_m
