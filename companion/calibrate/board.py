@@ -157,9 +157,6 @@ Paper = Literal["a4", "a3", "letter"]
 ACROSS, DOWN = 8, 11  # squares
 _MARKER = 0.72  # of a square's side
 _DICTIONARY = cv2.aruco.DICT_4X4_100
-_SHEETS_MM: dict[str, tuple[float, float, float]] = {  # width, height, square
-    "a4": (210.0, 297.0, 23.0), "a3": (297.0, 420.0, 33.0), "letter": (215.9, 279.4, 22.0),
-}  # fmt: skip
 _DOTS_PER_SQUARE = 200
 _TEXT_MM = 5.0  # below the board
 
@@ -172,10 +169,12 @@ class BoardPage:
     height_mm: float
     square_mm: float
 
-    @classmethod
-    def of(cls, paper: Paper) -> BoardPage:
-        """The page of that paper with the largest board that leaves a printer's margins."""
-        return cls(*_SHEETS_MM[paper])
+
+# Of each paper with the largest board that leaves a printer's margins.
+_PAGES = {
+    "a4": BoardPage(210.0, 297.0, 23.0), "a3": BoardPage(297.0, 420.0, 33.0),
+    "letter": BoardPage(215.9, 279.4, 22.0),
+}  # fmt: skip
 
 
 def charuco() -> cv2.aruco.CharucoBoard:
@@ -195,7 +194,7 @@ def write_sheet(path: Path, paper: Paper) -> BoardPage:
     for another suffix, or if it cannot be written.
     Printed at 100 %, the squares have the size stated on the sheet.
     """
-    sheet = BoardPage.of(paper)
+    sheet = _PAGES[paper]
     result_file(path, "--print", (".pdf", ".png"))
     dots_per_inch = 25.4 * _DOTS_PER_SQUARE / sheet.square_mm
     with writing(path, "--print"):

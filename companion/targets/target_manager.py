@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -50,9 +51,7 @@ _LEFT, _LEAVES_MPS = 0.5, 5.0  # the chance that it left then, and how fast, axi
 _GROUND_EVERY = 3  # so many of the kept pictures show the ground well enough
 _LOST_S = 4.0
 _SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
-_REPORT_AGAIN_NS = (
-    10_000_000_000  # one of all targets in so long: a flood of texts hides the others
-)
+_REPORT_AGAIN_NS = 10_000_000_000  # one of all targets in so long: a flood hides the others
 _LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
 _BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
 _BACK_GAP_S = 0.5
@@ -92,11 +91,6 @@ class TargetEstimate:
     fix: TargetFix
     estimate: PoseEstimate
 
-    @property
-    def velocity(self) -> Array | None:
-        """(3,) m/s, world axes; None for a static target or after one detection."""
-        return self.fix.velocity
-
 
 @dataclass
 class _TargetState:
@@ -134,11 +128,6 @@ class _Back:
     since_ns: int
     time_ns: int
     position: Array
-
-
-def _number(name: str) -> int:
-    """Number of a clicked target, by its name."""
-    return clicked_number(name) or 0
 
 
 class TargetManager:
@@ -189,9 +178,7 @@ class TargetManager:
         fix = track.observe(click.estimate, click.pixel, drift=self._drift(click))
         if fix is None:
             self.missed += 1
-            self._report_alert(
-                alert(AlertId.TARGET_REFUSED, number=click.number, why=Name(str(track.refusal)))
-            )
+            self._tell(AlertId.TARGET_REFUSED, name, why=Name(str(track.refusal)))
             self._on_gone(name)
             return
         life = _TargetState(track, time_ns, True, time_ns, found_ns=time_ns, begun_ns=time_ns)
@@ -201,7 +188,7 @@ class TargetManager:
             life.extent_m = (click.extent[0] * cell, click.extent[1] * cell)
         self._lives[name] = life
         sigma = float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1]))
-        self._report_alert(alert(AlertId.TARGET_FOUND, number=click.number, metres=sigma))
+        self._tell(AlertId.TARGET_FOUND, name, metres=sigma)
         self._report(life, fix, click.estimate)
         self._follow(name, life, click, fix)
 
@@ -255,8 +242,7 @@ class TargetManager:
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
-                self._report_alert(alert(AlertId.TARGET_OUT_OF_VIEW, number=_number(name)))
-                self.end((name,))
+                self._end_with(AlertId.TARGET_OUT_OF_VIEW, name)
                 continue
             self._report(life, fix, estimate)
 
@@ -265,6 +251,14 @@ class TargetManager:
         for name in names:
             if self._lives.pop(name, None) is not None:
                 self._on_gone(name)
+
+    def _tell(self, of: AlertId, name: str, **values: Any) -> None:
+        """Send an alert of a clicked target."""
+        self._report_alert(alert(of, number=clicked_number(name), **values))
+
+    def _end_with(self, of: AlertId, name: str, **values: Any) -> None:
+        self._tell(of, name, **values)
+        self.end((name,))
 
     def _follow(self, name: str, life: _TargetState, click: Click, fix: TargetFix) -> None:
         """Begin to track a clicked target in the image: from the clicked frame, if it is kept,
@@ -308,8 +302,7 @@ class TargetManager:
             life.found_ns = life.seen_ns = time_ns
             life.refused_ns = 0 if fix is not None else life.refused_ns or time_ns
         elif track.moves and since_s > _LOST_S and not self._may_be_back(life, time_ns):
-            self._report_alert(alert(AlertId.TARGET_LOST, number=_number(name)))
-            self.end((name,))
+            self._end_with(AlertId.TARGET_LOST, name)
             return
         elif track.moves:
             fix = track.coast(estimate)
@@ -319,12 +312,7 @@ class TargetManager:
             life.reported_ns = time_ns
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
-            self._report_alert(
-                alert(
-                    AlertId.TARGET_NOT_LOCATED, number=_number(name), why=Name(str(track.refusal))
-                )
-            )
-            self.end((name,))
+            self._end_with(AlertId.TARGET_NOT_LOCATED, name, why=Name(str(track.refusal)))
 
     def _find_leaving(
         self, name: str, life: _TargetState, picture: tuple[PoseEstimate, Gray], position: Array
@@ -336,9 +324,8 @@ class TargetManager:
         if follower is None:
             return None
         time_ns = estimate.exposure_time_ns
-        if (
-            left := self._find_departed_moving(life, follower, estimate, gray, position)
-        ) is not None:
+        left = self._find_departed_moving(life, follower, estimate, gray, position)
+        if left is not None:
             return left if self._moves_steadily(life, left, position, time_ns) else None
         near = follower.find(gray, estimate, position, _STILL_M)
         is_over = time_ns - life.begun_ns > _DEPARTS_S * 1e9
@@ -374,10 +361,8 @@ class TargetManager:
         If the target only looks different, the operator is told: after a sudden change it may have
         left.
         """
-        number = _number(name)
         if life.moved_at_once and follower.shows_ground(gray, estimate):
-            self._report_alert(alert(AlertId.TARGET_LEFT, number=number))
-            self.end((name,))
+            self._end_with(AlertId.TARGET_LEFT, name)
             return True
         held = life.track.hold(estimate)
         is_in_view = held is not None and held.visibility is Visibility.HELD
@@ -387,11 +372,11 @@ class TargetManager:
             return False
         if follower.is_changed and not life.changed_ns:
             life.changed_ns = life.found_ns
-            self._report_alert(alert(AlertId.TARGET_MAY_HAVE_LEFT, number=number))
+            self._tell(AlertId.TARGET_MAY_HAVE_LEFT, name)
         elif not life.is_slide_reported and not life.changed_ns:
             # The view of what is not flat changes by and by: its place is as good as before.
             life.is_slide_reported = True
-            self._report_alert(alert(AlertId.TARGET_HELD, number=number))
+            self._tell(AlertId.TARGET_HELD, name)
         return False
 
     @staticmethod
@@ -422,7 +407,7 @@ class TargetManager:
         life.found_ns, life.unseen_ns = time_ns, 0
         if life.changed_ns:
             life.changed_ns = 0
-            self._report_alert(alert(AlertId.TARGET_BACK, number=_number(name)))
+            self._tell(AlertId.TARGET_BACK, name)
 
     @staticmethod
     def _with_departure(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
@@ -519,11 +504,11 @@ class TargetManager:
         left shows its shape. A car that only passes over a clicked place does not take the place's
         appearance along, so no match is found.
         """
-        if (estimate.exposure_time_ns - life.found_ns) * 1e-9 > _DEPARTS_S:
+        since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
+        if since_s > _DEPARTS_S:
             return None
         if not follower.is_isolated and not follower.isolate(((estimate, gray),)):
             return None
-        since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
         found = follower.find(gray, estimate, position, _NEAR_M + _FASTEST_MPS * since_s)
         if found is not None and (life.moved_at_once or found.score >= _DEPARTED):
             return found

@@ -88,7 +88,7 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
     from companion.trial.deployment import write_trial_deployment
     from companion.trial.page import write_trial
     from companion.trial.result import trial_verdict
-    from companion.trial.run import TrialOptions, run_trial
+    from companion.trial.run import run_trial
     from localizer.map.cache.cache import TileCache
 
     TileCache.open(map_cache)  # what is missing is said before anything is computed
@@ -97,7 +97,7 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
     def stage(what: str) -> AbstractContextManager[Callable[..., None]]:
         return show_count(console, what, begins=COMPILES if what == "localizing" else "begun")
 
-    trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
+    trial = run_trial(flight, map_cache, width, searches, stage)
     judgement = trial_verdict(trial)
     tell_notes((f"camera by {flight.camera.source}", *trial.notes))
     with show_steps(console) as say:

@@ -44,11 +44,11 @@ def _photos(folder, sequence, frame: LocalFrame, camera: Camera):
         pose = world_from_camera(row, frame)
         told = frame.position(pose.translation - [_EAST_M, 0.0, 0.0])
         down = so3_exp([-np.radians(_UP_DEG), 0.0, 0.0])  # about the image's right
-        gimbal = gimbal_of_pose(Pose(pose.rotation @ down, pose.translation), frame)
+        roll, pitch, yaw = gimbal_of_pose(Pose(pose.rotation @ down, pose.translation), frame)
         xmp = dji(GpsLatitude=told.latitude_deg, GpsLongitude=told.longitude_deg,
                   AbsoluteAltitude=told.height_m, AltitudeType="RtkAlt",
-                  GimbalRollDegree=gimbal.roll_deg, GimbalPitchDegree=gimbal.pitch_deg,
-                  GimbalYawDegree=gimbal.yaw_deg)  # fmt: skip
+                  GimbalRollDegree=roll, GimbalPitchDegree=pitch,
+                  GimbalYawDegree=yaw)  # fmt: skip
         pixels = np.asarray(Image.open(sequence / "images" / row.name).convert("RGB"))
         focal = camera.fx * 43.267 / np.hypot(camera.width, camera.height)
         name = row.name.rsplit(".", 1)[0] + ".jpg"
