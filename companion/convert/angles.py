@@ -47,7 +47,8 @@ def pose_of_autopilot(angles: AutopilotAngles, frame: LocalFrame) -> Pose:
     """The camera's pose in the map. The position is taken as the camera's: no lever arm."""
     p = angles.position
     body = matrix_from_euler(*np.radians(angles.body_deg))
-    gimbal = GimbalAngles(*np.radians(angles.gimbal_deg), angles.gimbal_frame)
+    roll, pitch, yaw = map(math.radians, angles.gimbal_deg)
+    gimbal = GimbalAngles(roll, pitch, yaw, angles.gimbal_frame)
     return world_from_camera(
         frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m),
         body,

@@ -254,7 +254,7 @@ class TargetManager:
 
     def _tell(self, of: AlertId, name: str, **values: Any) -> None:
         """Send an alert of a clicked target."""
-        self._report_alert(alert(of, number=clicked_number(name), **values))
+        self._report_alert(alert(of, number=clicked_number(name) or 0, **values))
 
     def _end_with(self, of: AlertId, name: str, **values: Any) -> None:
         self._tell(of, name, **values)

@@ -64,9 +64,13 @@ class TargetTrack:
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id, self._settings, self._cast = target_id, settings, cast
+        self._static = StaticTarget(settings.map_sigma_m)
+        self._moving = TargetFilter()
+        self._moves = False
         self._stands_since_ns = 0
+        self._outliers = 0
+        self._last = LastPosition(round(settings.confirm_s * 1e9))
         self._seen_ns = 0
-        self._begin_anew()
         self._aim: Array = np.zeros((3, 3))
         self.refusal: TargetRefusal | None = None
 
