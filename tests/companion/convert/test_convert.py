@@ -22,7 +22,6 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
 from localizer.geometry.posefile import (
     PoseRow,
-    pose_row,
     read_poses,
     world_from_camera,
     write_poses,
@@ -238,16 +237,6 @@ def test_a_photo_without_a_fix_is_named(tmp_path):
         _convert(tmp_path, tmp_path / "o", *PHOTOS)
 
 
-def test_photos_of_another_maker_are_read_as_try_reads_them(tmp_path):
-    """Pix4D's Camera tags: pitch 0 looks down."""
-    xmp = '<x:xmpmeta Camera:Pitch="30" Camera:Roll="0" Camera:Yaw="90"></x:xmpmeta>'
-    _photo(tmp_path / "A.JPG", xmp)
-    _convert(tmp_path, tmp_path / "o", *PHOTOS)
-    (row,) = read_poses(tmp_path / "o")
-    R = world_from_camera(row, LocalFrame(row.position)).rotation
-    assert R[:, 2] == pytest.approx([0.5, 0, -np.sqrt(0.75)], abs=1e-6)
-
-
 @pytest.mark.parametrize("name", ["a.jpg", "b.JPG", "a.xmp", "c.mp4", "d.DNG"])
 def test_no_result_replaces_footage(tmp_path, name):
     _placed(tmp_path / "a.jpg")
@@ -263,13 +252,6 @@ def test_no_sidecar_replaces_the_one_that_is_read(tmp_path):
         with pytest.raises(ReportError, match="would replace"):
             _convert(source, tmp_path, "--from", "photos", "--to", "photos",
                      "--heights", "ellipsoidal", *PLACE)  # fmt: skip
-
-
-def test_what_a_mac_leaves_beside_photos_is_none(tmp_path):
-    _placed(tmp_path / "DJI_0.JPG")
-    (tmp_path / "._DJI_0.JPG").write_bytes(bytes(4096))
-    _convert(tmp_path, tmp_path / "o", *PHOTOS)
-    assert len(read_poses(tmp_path / "o")) == 1
 
 
 @pytest.mark.parametrize("gimbal_frame", ["heading", "earth", "body"])
@@ -380,21 +362,3 @@ def test_a_map_or_an_origin_is_needed(poses, tmp_path):
     with pytest.raises(ConfigError, match="either --map or --origin"):
         _convert(poses, tmp_path / "x", "--from", "poses", "--to", "colmap", "--map", tmp_path,
                  *PLACE)  # fmt: skip
-
-
-# --- The tables of angles.md say what the conversions say ---------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("gimbal", "row"),
-    [
-        ((0, -40, 60), (0, 50, -60)),  # the figure's
-        ((0, -90, 0), (0, 0, 0)),  # straight down, the picture's top to the north
-        ((0, 0, -90), (0, 90, 90)),  # level, to the west
-    ],
-)
-def test_the_tables_zeros_and_signs(gimbal, row):
-    place = Geodetic(47.3, 8.5, 500.0)
-    level = AutopilotAngles("", None, place, (0.0, 0.0, 0.0), gimbal)
-    found = pose_row("", pose_of_autopilot(level, LocalFrame(place)), LocalFrame(place))
-    assert (found.roll_deg, found.pitch_deg, found.yaw_deg) == pytest.approx(row, abs=1e-9)

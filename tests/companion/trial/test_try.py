@@ -14,7 +14,6 @@ from companion.cli.commands import app
 from companion.config import load_config
 from companion.convert.angles import gimbal_of_pose
 from companion.errors import FootageError, ReportError
-from companion.planning.way import MapHeights
 from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
@@ -236,25 +235,6 @@ def test_one_photo_of_the_climb_does_not_set_the_height_of_a_flight(
     bands = likely_height(prior, [ground + height for height in found])
     assert [round(z - ground) for z, _ in bands] == ([likely] if likely else [])
     assert all(5.0 <= sigma < 10.0 for _, sigma in bands)
-
-
-@pytest.mark.parametrize(("factor", "told"), [(1.0, 0), (0.3048, 1), (0.6, 0)])
-def test_a_map_with_heights_in_feet_is_named(small_assets, tmp_path, factor, told):
-    """By the photos' two heights, whose difference is the ground's below the take-off."""
-    cache = TileCache.open(small_assets.map_cache)
-    middle = cache.frame.position(np.zeros(3))
-    height_m = MapHeights(cache).height_m(0.0, 0.0)
-    assert height_m is not None
-    assert cache.manifest.geoid_separation_m is not None
-    ground_m = height_m + middle.height_m - cache.manifest.geoid_separation_m
-    assert ground_m > 250.0  # otherwise feet and metres differ by less than these heights err
-    for k in range(4):
-        xmp = dji(GpsLatitude=middle.latitude_deg, GpsLongitude=middle.longitude_deg + 1e-5 * k,
-                  AbsoluteAltitude=factor * ground_m + 60, RelativeAltitude=60)  # fmt: skip
-        write_photo(tmp_path / f"{k}.jpg", xmp, exif={_FOCAL_35: 24})
-    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    notes = priors_of(flight, cache).notes
-    assert sum("--height-unit ft" in note for note in notes) == told, notes
 
 
 def test_without_a_map_the_needed_one_is_named(tmp_path):
