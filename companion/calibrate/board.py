@@ -242,10 +242,10 @@ def watch_board(
     one, with the number of views, the result of the newest image and the missing views. keep:
     folder for the images used, which is created; None for none. `StreamError` if the source fails.
     """
-    size = read_stream_size(source)
-    views = BoardViews(size.width, size.height)
+    width, height = read_stream_size(source)
+    views = BoardViews(width, height)
     # Any model of the pictures' size: it is what is being looked for.
-    camera = Camera.from_fov(size.width, size.height, 65.0)
+    camera = Camera.from_fov(width, height, 65.0)
     feed = open_source(source, camera, SourceSettings())
     timer = threading.Timer(seconds, feed.close)
     timer.daemon = True
@@ -267,4 +267,4 @@ def watch_board(
     finally:
         timer.cancel()
         feed.close()
-    return BoardViewing(tuple(views.views), tuple(views.missing()), size.width, size.height)
+    return BoardViewing(tuple(views.views), tuple(views.missing()), width, height)

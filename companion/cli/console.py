@@ -40,10 +40,7 @@ def console_command(
     # The flight is met by the deployment's own address, whatever this page listens on.
     meeting = given.listen
     if listen is not None:
-        try:
-            given = validated(ConsoleConfig, given.model_dump() | {"listen": listen})
-        except SettingsError as error:
-            raise ConfigError(f"--listen {listen}: {str(error).strip()}") from error
+        given = listening("--listen", listen, given)
     os.setpriority(os.PRIO_PROCESS, 0, min(os.getpriority(os.PRIO_PROCESS, 0) + _NICE, _LOWEST))
     if lifeline:
         threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()
@@ -59,6 +56,15 @@ def console_command(
     records = Records(None if record is None else record.parent)
     token = read_token(given.token_file)
     serve(ConsoleSite(given, source, settings.map, records, config.absolute(), token))
+
+
+def listening(option: str, listen: str, given: ConsoleConfig | None = None) -> ConsoleConfig:
+    """The settings with another address:port; `ConfigError` names the option that gave it."""
+    settings = {} if given is None else given.model_dump()
+    try:
+        return validated(ConsoleConfig, settings | {"listen": listen})
+    except SettingsError as error:
+        raise ConfigError(f"{option} {listen}: {str(error).strip()}") from error
 
 
 def require_extra() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
-from companion.cli.output import show_table, tell
+from companion.cli.output import show_table, tell, tell_warnings
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
 from companion.writing import result_file, write_result, writing
@@ -163,7 +163,7 @@ def build(
     )
     if manifest.skipped:
         tell(f"[yellow]{len(manifest.skipped)} source tiles were left out")
-    _print_warnings(manifest.warnings)
+    tell_warnings(manifest.warnings)
     if overview:
         _make_overview(out)
 
@@ -205,11 +205,6 @@ def _with_ground(
                 write_flat_ground(source[0], ground_m, ground, rules)
             source = [*source, ground]
         yield source
-
-
-def _print_warnings(warnings: Iterable[str]) -> None:
-    for text in warnings:
-        tell(f"[yellow]warning:[/] {escape(text)}")
 
 
 @app.command("info")
@@ -262,7 +257,7 @@ def info(
         for one in levels(opened)
     ]  # fmt: skip
     show_table(("level", "tiles", "texel m", "geometric error m", "MB"), rows)
-    _print_warnings(m.warnings)
+    tell_warnings(m.warnings)
     for file, written, option in ((geojson, as_geojson, "--geojson"), (kml, as_kml, "--kml")):
         if file is not None:
             write_result(file, written(m, opened.path.name), option)
@@ -282,7 +277,7 @@ def verify(cache: CachePath) -> None:
     opened = TileCache.open(cache)
     with show_work(Console(stderr=True), f"hashing {opened.manifest.tiles} tiles, seeking holes"):
         result = check(opened)
-    _print_warnings(opened.manifest.warnings)
+    tell_warnings(opened.manifest.warnings)
     for line in result.damaged:
         tell(f"[red]{line}")
     for hole in result.holes[:10]:

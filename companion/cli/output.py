@@ -22,6 +22,12 @@ def tell_notes(notes: Iterable[str]) -> None:
         tell(escape(note), "yellow", err=True)
 
 
+def tell_warnings(texts: Iterable[str]) -> None:
+    """Print each warning (plain text)."""
+    for text in texts:
+        tell(f"[yellow]warning:[/] {escape(text)}")
+
+
 def show_table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None,
     numbers: Sequence[str] = (),

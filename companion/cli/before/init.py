@@ -148,16 +148,15 @@ def _map_hash(map_cache: Path) -> str:
 
 
 def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
-    from companion.redaction import redacted
     from companion.setup.asking import read_stream_size
 
     try:
-        seen = read_stream_size(feed)
+        width, height = read_stream_size(feed)
     except (CompanionError, LocalizerError) as error:
         notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
         return None
-    typer.echo(f"stream: {seen.width}x{seen.height}")
-    return seen.width, seen.height
+    typer.echo(f"stream: {width}x{height}")
+    return width, height
 
 
 def _model(

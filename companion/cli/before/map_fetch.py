@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.cli.before.shared_options import numbers
-from companion.cli.output import show_table, tell
+from companion.cli.output import show_table, tell, tell_warnings
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
 from companion.writing import result_file
@@ -231,34 +229,27 @@ def _print_estimate(parts: list[_Part]) -> float:
             f"{expected.seconds:.0f} s at {part.source.rate_per_s:g} requests/s"
         )
         tell(f"  licence: {part.source.licence}")
-        for name in part.plan.lacking:
-            tell(
-                f"[yellow]warning:[/] {part.source.name} has no {escape(name)}: sea, or land that "
-                "it lacks; the map has a hole there"
-            )
+        tell_warnings(
+            f"{part.source.name} has no {name}: sea, or land that it lacks; the map has a hole "
+            "there"
+            for name in part.plan.lacking
+        )
     return total
 
 
 def _fetched(part: _Part, area: Area) -> None:
     from localizer.map.fetch.fetch import fetch
 
-    what = f"fetching {part.source.name}"
-    with _counted_text(what) as progress:
-        known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
+    try:
+        with show_count(Console(stderr=True), f"fetching {part.source.name}") as progress:
+            known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
+    except KeyboardInterrupt:
+        tell("interrupted: the same command goes on with what has come", err=True)
+        raise
     tell(
         f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
         f"{100 * known:.1f} % of its raster known"
     )
-
-
-@contextmanager
-def _counted_text(what: str) -> Iterator[Callable[[int, int], None]]:
-    try:
-        with show_count(Console(stderr=True), what) as progress:
-            yield progress
-    except KeyboardInterrupt:
-        tell("interrupted: the same command goes on with what has come", err=True)
-        raise
 
 
 def _raise_buildings(part: _Part, footprints: Footprints) -> _Part:
@@ -270,9 +261,8 @@ def _raise_buildings(part: _Part, footprints: Footprints) -> _Part:
         done = raise_buildings(part.out, footprints, out)
     tell(escape(f"{footprints.path.name}: {done.line()}"))
     if not footprints.attribution:
-        tell(
-            "[yellow]warning:[/] nobody says whose the footprints are: name them with "
-            "--footprints-attribution"
+        tell_warnings(
+            ("nobody says whose the footprints are: name them with --footprints-attribution",)
         )
     buildings = footprints.attribution or footprints.path.name
     whose = f"{part.source.attribution}; buildings: {buildings}"
@@ -299,8 +289,7 @@ def _built(parts: list[_Part], out: Path, overwrite: bool, workers: int | None) 
     )
     with show_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
         manifest = build_cache([parts[1].out, parts[0].out], out, options, progress=bar)
-    for text in manifest.warnings:
-        tell(f"[yellow]warning:[/] {escape(text)}")
+    tell_warnings(manifest.warnings)
     with show_work(Console(stderr=True), "verifying the cache"):
         found = verify(TileCache.open(out))
     for line in found.damaged:
