@@ -11,11 +11,7 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.errors import ReportError
-from localizer.errors import CameraError, OutsideMapError, SequenceError
-from localizer.map.building.build import build_cache
-from sitl.demo.kinematic import record_scenario
-from sitl.demo.scenario import CameraSpec, Scenario
-from sitl.rehearsal.rehearse import rehearse
+from localizer.errors import OutsideMapError, SequenceError
 
 FRAMES = 25
 
@@ -131,16 +127,6 @@ def test_images_that_cannot_be_used_are_named_and_counted_and_the_rest_is_locali
         _run(*arguments, "--limit", 1)
 
 
-def test_a_wrong_camera_file_is_named(recorded, tmp_path):
-    assets, sequence = recorded
-    broken = tmp_path / "broken"
-    shutil.copytree(sequence, broken)
-    camera = json.loads((broken / "camera.json").read_text())
-    (broken / "camera.json").write_text(json.dumps(camera | {"fx": -1}))
-    with pytest.raises(CameraError, match=r"camera\.json: focal lengths"):
-        _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
-
-
 def test_a_report_that_cannot_be_written_is_told_before_the_work(recorded, tmp_path):
     assets, _ = recorded
     (tmp_path / "r").touch()
@@ -182,20 +168,3 @@ def test_real_photos_are_localized_on_their_orthophoto(real_data, tmp_path):
     assert report["recall_1"] == 100.0
     assert report["median_translation_m"] < 0.12
     assert report["median_rotation_deg"] < 0.12
-
-
-@pytest.mark.real
-def test_views_of_a_real_mesh_are_localized_through_a_real_camera(real_data, tmp_path):
-    """quito's mesh, filmed at dusk by a rolling camera whose calibration is off, without a flight.
-
-    Map and pictures share the mesh: what is told apart here is everything else.
-    """
-    build_cache(real_data("quito") / "tileset.json", tmp_path / "map")
-    spoiled = Scenario(condition="dusk", camera=CameraSpec(rate_hz=1.0))
-    done = rehearse(tmp_path / "map", None, None, spoiled)
-    assert record_scenario(done.assets, done.scenario, 2, tmp_path / "sequence") > 8
-    _run(tmp_path / "sequence", "--map", tmp_path / "map", "--report", tmp_path / "r",
-         "--limit", 8, "--prior", "each")  # fmt: skip
-    report = json.loads((tmp_path / "r" / "report.json").read_text())
-    assert report["recall_1"] == 100.0
-    assert report["median_translation_m"] < 0.4

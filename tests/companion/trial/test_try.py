@@ -201,13 +201,18 @@ def test_searches_end_where_none_of_the_first_finds_anything():
     assert count({chosen[6]}) == 6
 
 
-def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_assets, tmp_path):
-    """From 82 m, the middle of the whole range, no photo that was taken at 49 m was found."""
+@pytest.fixture
+def prior(small_assets, tmp_path):
+    """Of a photo whose height is not known."""
     cache = TileCache.open(small_assets.map_cache)
     middle = cache.frame.position(np.zeros(3))
     write_photo(tmp_path / "a.jpg", place=(middle.latitude_deg, middle.longitude_deg, 0.0))
     flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    (prior,) = priors_of(flight, cache).priors
+    return priors_of(flight, cache).priors[0]
+
+
+def test_an_unknown_height_is_searched_from_middles_near_any_true_one(prior):
+    """From 82 m, the middle of the whole range, no photo that was taken at 49 m was found."""
     assert not prior.height_known
     ground = prior.height_m - prior.clearance_m
     bands = [(z - ground, sigma) for z, sigma in height_bands(prior)]
@@ -222,15 +227,8 @@ def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_asse
     ("found", "likely"),
     [((), None), ((31,), None), ((31, 50), None), ((31, 50, 49), 49), ((50, 49, 31), 49)],
 )
-def test_one_photo_of_the_climb_does_not_set_the_height_of_a_flight(
-    small_assets, tmp_path, found, likely
-):
+def test_one_photo_of_the_climb_does_not_set_the_height_of_a_flight(prior, found, likely):
     """With the height of the first photo found, 11 of 12 real ones 20 m above it were lost."""
-    cache = TileCache.open(small_assets.map_cache)
-    middle = cache.frame.position(np.zeros(3))
-    write_photo(tmp_path / "a.jpg", place=(middle.latitude_deg, middle.longitude_deg, 0.0))
-    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    (prior,) = priors_of(flight, cache).priors
     ground = prior.height_m - prior.clearance_m
     bands = likely_height(prior, [ground + height for height in found])
     assert [round(z - ground) for z, _ in bands] == ([likely] if likely else [])
