@@ -55,7 +55,7 @@ class Guess:
 
 class CalibrationProblem:
     """Observations of K frames with N patches in all, relative to a deployment's camera model,
-    mount (3, 3) and lever arm arm_m (3,).
+    mount (3, 3) and lever arm arm_m (3,). start: the deployment's values and the recorded poses.
     """
 
     def __init__(
@@ -75,16 +75,11 @@ class CalibrationProblem:
         self.placed: NDArray[np.bool_] = np.array([f.window.has_place for f in frames])
         heights = self._place[:, self._place.shape[1] // 2, 2]
         self._ground_m = float(np.nanmin(heights)) if self.placed.any() else 0.0
-        self._start = Guess(
+        self.start = Guess(
             np.zeros(u.COUNT),
             np.array([f.pose.rotation for f in frames]),
             np.array([f.pose.translation for f in frames]),
         )
-
-    @property
-    def start(self) -> Guess:
-        """The deployment's values and the recorded poses."""
-        return self._start
 
     @property
     def grounds(self) -> Array:
@@ -94,15 +89,11 @@ class CalibrationProblem:
         middles: Array = np.add.reduceat(self._points[:, :2], begins, axis=0) / counts[:, None]
         return middles
 
-    def camera_of(self, shared: Array) -> Camera:
-        """The deployment's camera model with these corrections (COUNT,)."""
-        return changed_camera(self._camera, shared)
-
     def pixel_residuals(self, guess: Guess) -> Array:
         """(N, 2): predicted minus measured, weighted by each patch's information, px."""
         away = self._points - guess.places[self.owner]
         x, y, z = np.einsum("nji,nj->in", guess.rotations[self.owner], away)
-        c = self.camera_of(guess.shared)
+        c = changed_camera(self._camera, guess.shared)
         xd, yd = c.distorted(x / z, y / z)
         off = np.stack([c.fx * xd + c.cx, c.fy * yd + c.cy], axis=1) - self._pixels
         weighted: Array = np.einsum("nij,nj->ni", self._root, off)

@@ -125,7 +125,7 @@ def shadow_check(
         for message in messages.before:
             player.bridge.play(message)
         dated: Iterator[tuple[int, Any]] = heapq.merge(
-            ((t + to_record, m) for t, m in messages.dated()),
+            ((t + to_record, m) for t, m in messages.dated),
             ((f.exposure_time_ns + flight.log.ahead_ns + to_record + delay_ns, f) for f in frames),
             key=lambda one: one[0],
         )
@@ -141,35 +141,31 @@ def shadow_check(
 
 
 class _Messages:
-    """The log's messages during the images. before: messages that must be known at the begin;
-    origin: the EKF's, GPS_GLOBAL_ORIGIN.
+    """The log's messages during the images. dated: in the order of their times; before: messages
+    that must be known at the begin; origin: the EKF's, GPS_GLOBAL_ORIGIN.
     """
 
     def __init__(self, path: Path, begin_ns: int, end_ns: int) -> None:
         self.notes: tuple[str, ...] = ()
-        self._within: list[Dated] = []
+        self.dated: list[Dated] = []
         before: dict[tuple[int, str], Any] = {}
         for time_ns, message in vehicle_messages(path):
             if time_ns < begin_ns:
                 before[message.get_srcSystem(), message.get_type()] = message
             elif time_ns <= end_ns:
-                self._within.append((time_ns, message))
-        self._within.sort(key=lambda one: one[0])
-        if not self._within:
+                self.dated.append((time_ns, message))
+        self.dated.sort(key=lambda one: one[0])
+        if not self.dated:
             raise RecordError(f"{path}: holds nothing of the time of the images")
         self.before = tuple(m for (_, kind), m in before.items() if kind in _TOLD_BEFORE)
-        every = (*before.values(), *(m for _, m in self._within))
+        every = (*before.values(), *(m for _, m in self.dated))
         told = [m for m in every if m.get_type() == "GPS_GLOBAL_ORIGIN"]
         self.origin = told[-1] if told else self._origin(path)
-
-    def dated(self) -> list[Dated]:
-        """The messages in the order of their times."""
-        return self._within
 
     def _origin(self, path: Path) -> Any:
         """The EKF's origin, by local and global position at one time; else its first position."""
         local, place = None, None
-        for _, message in self._within:
+        for _, message in self.dated:
             if message.get_type() == "LOCAL_POSITION_NED":
                 local = message
             elif message.get_type() == "GLOBAL_POSITION_INT" and message.lat:

@@ -174,36 +174,33 @@ class RecordedFlight:
 
 
 class Track:
-    """Telemetry over time with interpolation; None in gaps above `gap_s`."""
+    """Telemetry over time with interpolation; None in gaps above `gap_s`. times_ns: ascending times
+    of the samples, int64.
+    """
 
     def __init__(self, samples: Sequence[Telemetry], gap_s: float = 2.5) -> None:
         dated = sorted((s.time_ns, k) for k, s in enumerate(samples) if s.time_ns is not None)
         self._samples = tuple(samples[k] for _, k in dated)
-        self._times = np.array([t for t, _ in dated], dtype=np.int64)
+        self.times_ns = np.array([t for t, _ in dated], dtype=np.int64)
         self._gap_ns = round(1e9 * gap_s)
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    @property
-    def times_ns(self) -> np.ndarray:
-        """Ascending times of the samples, int64."""
-        return self._times
-
     def at(self, time_ns: int) -> Telemetry | None:
         """Telemetry at a time (ns), interpolated; None in gaps and outside the samples, except
         within a tenth of `gap_s`, where the nearest one is returned.
         """
-        if not len(self._times):
+        if not len(self.times_ns):
             return None
-        after = int(np.searchsorted(self._times, time_ns))
-        if after < len(self._times) and self._times[after] == time_ns:
+        after = int(np.searchsorted(self.times_ns, time_ns))
+        if after < len(self.times_ns) and self.times_ns[after] == time_ns:
             return self._samples[after]
-        if after in (0, len(self._times)):
+        if after in (0, len(self.times_ns)):
             near = 0 if after == 0 else after - 1
-            away_ns = abs(int(self._times[near]) - time_ns)
+            away_ns = abs(int(self.times_ns[near]) - time_ns)
             return self._samples[near] if away_ns < self._gap_ns // 10 else None
-        begin, end = int(self._times[after - 1]), int(self._times[after])
+        begin, end = int(self.times_ns[after - 1]), int(self.times_ns[after])
         if end - begin > self._gap_ns:
             return None
         return _between(

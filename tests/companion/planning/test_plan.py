@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import MissionFileError
 from companion.geometry import Mount
-from companion.planning.alternatives import alternatives_at
 from companion.planning.flown import flown_legs, flown_words
 from companion.planning.mission import HeightAbove, read_mission
+from companion.planning.plan import alternatives_at
 from companion.planning.verdicts import (
     LegVerdict,
     MissionLimits,
