@@ -141,7 +141,9 @@ FIELDS = {
     **{tag.FIRST_CORNER + k: (-33.8 - 0.01 * k, 151.0 + 0.01 * k)[k % 2] for k in range(8)},
     tag.PLATFORM_PITCH_FULL: -81.5, tag.PLATFORM_ROLL_FULL: 66.6,
 }  # fmt: skip
-COARSE = {  # half a step of the two-byte fields
+COARSE = {  # half a step
+    **dict.fromkeys((tag.SENSOR_LATITUDE, tag.CENTRE_LATITUDE, tag.TARGET_LATITUDE), 2.2e-8),
+    **dict.fromkeys((tag.SENSOR_LONGITUDE, tag.CENTRE_LONGITUDE, tag.TARGET_LONGITUDE), 4.3e-8),
     tag.PLATFORM_HEADING: 0.003, tag.PLATFORM_PITCH: 0.0004, tag.PLATFORM_ROLL: 0.0008,
     tag.SENSOR_ALTITUDE: 0.16, tag.HORIZONTAL_FOV: 0.0014, tag.VERTICAL_FOV: 0.0014,
     tag.CENTRE_ELEVATION: 0.16, tag.TARGET_ELEVATION: 0.16, tag.SENSOR_HEIGHT: 0.16,
