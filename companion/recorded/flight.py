@@ -6,6 +6,7 @@ pitch -90 looks down, yaw clockwise from true north. `None` means not recorded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -24,6 +25,8 @@ from localizer.types import Frame
 
 Kind = Literal["photos", "video", "sequence"]
 TILT_DEG, HEADING_DEG = 2.0, 6.0  # sigmas of a gimbal that is not calibrated, and of its compass
+ABSOLUTE_M = 30.0  # of a drone's altitude without RTK: barometer and model of the atmosphere
+_BAROMETER_M, _BAROMETER_SHARE = 2.0, 0.02
 
 
 class Datum(Enum):
@@ -41,6 +44,12 @@ class Height:
     value_m: float
     datum: Datum
     sigma_m: float
+
+    @classmethod
+    def by_barometer(cls, value_m: float) -> Height:
+        """A height above the take-off point by a drone's barometer."""
+        sigma = math.hypot(_BAROMETER_M, _BAROMETER_SHARE * value_m)
+        return cls(value_m, Datum.TAKEOFF, sigma)
 
 
 @dataclass(frozen=True)
