@@ -59,6 +59,10 @@ _BENDS = 0.4  # of its way: a bend behind the roof leads it so far aside of its 
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
 
 
+_Picture = tuple[PoseEstimate, Gray]
+"""The estimate of an accepted frame, and the frame in grey."""
+
+
 def _off(a: Array, b: Array) -> float:
     return float(np.linalg.norm(a - b))
 
@@ -161,9 +165,7 @@ class TargetManager:
             confirm_s=config.confirm_s,
         )
         self._lives: dict[str, _TargetState] = {}
-        self._pictures = RecentPictures[tuple[PoseEstimate, Gray]](
-            _PICTURES, lambda picture: picture[1].nbytes
-        )
+        self._pictures = RecentPictures[_Picture](_PICTURES, lambda picture: picture[1].nbytes)
         self._silence_reported_ns = -_REPORT_AGAIN_NS
         self.missed = 0
         self.doubted = 0
@@ -223,7 +225,7 @@ class TargetManager:
         """Track each clicked target in the image of an accepted estimate: (H, W) uint8 grey."""
         self._pictures.append((estimate, gray))
         for name, life in [(n, x) for n, x in self._lives.items() if x.follower is not None]:
-            self._look_for(name, life, estimate, gray)
+            self._look_for(name, life, (estimate, gray))
 
     def predict(self, estimate: PoseEstimate) -> None:
         """Report each clicked target at the estimate's frame, at most `rate_hz` times a second; end
@@ -269,33 +271,30 @@ class TargetManager:
         if not kept:
             return
         estimate, gray = min(kept, key=lambda p: abs(p[0].exposure_time_ns - time_ns))
+        taken_ns = estimate.exposure_time_ns
         half_m = None if life.extent_m is None else 0.5 * max(life.extent_m)
         follower = ImageFollower(gray, estimate, fix.position_world, half_m)
         if not follower.ready:
             return
-        others = [
-            p for p in self._pictures
-            if abs(p[0].exposure_time_ns - estimate.exposure_time_ns) > _PASSED_NS
-        ]  # fmt: skip
+        others = [p for p in self._pictures if abs(p[0].exposure_time_ns - taken_ns) > _PASSED_NS]
         life.moved_at_once = follower.isolate(others)
         life.follower = follower
-        for newer, picture in [
-            p for p in self._pictures if p[0].exposure_time_ns > estimate.exposure_time_ns
-        ]:
+        for picture in [p for p in self._pictures if p[0].exposure_time_ns > taken_ns]:
             if name in self._lives:
-                self._look_for(name, life, newer, picture)
+                self._look_for(name, life, picture)
 
-    def _look_for(self, name: str, life: _TargetState, estimate: PoseEstimate, gray: Gray) -> None:
+    def _look_for(self, name: str, life: _TargetState, picture: _Picture) -> None:
         """Find a target in an image; one that moves and is not found is predicted, then lost."""
-        time_ns, track, follower = estimate.exposure_time_ns, life.track, life.follower
+        estimate, track, follower = picture[0], life.track, life.follower
+        time_ns = estimate.exposure_time_ns
         expected = track.expected(time_ns)
         if follower is None or expected is None:
             return
         since_s = (time_ns - life.found_ns) * 1e-9
         if track.moves:
-            found = self._find_moving(life, follower, estimate, gray)
+            found = self._find_moving(life, follower, picture)
         else:
-            found = self._find_leaving(name, life, (estimate, gray), expected[0])
+            found = self._find_leaving(name, life, follower, picture, expected[0])
         fix = None
         if found is not None:
             fix = track.observe(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
@@ -306,7 +305,7 @@ class TargetManager:
             return
         elif track.moves:
             fix = track.coast(estimate)
-        elif since_s > _MISSED_S and self._is_gone(name, life, follower, estimate, gray):
+        elif since_s > _MISSED_S and self._is_gone(name, life, follower, picture):
             return
         if fix is not None and self._is_due(life, time_ns):
             life.reported_ns = time_ns
@@ -315,23 +314,22 @@ class TargetManager:
             self._end_with(AlertId.TARGET_NOT_LOCATED, name, why=Name(str(track.refusal)))
 
     def _find_leaving(
-        self, name: str, life: _TargetState, picture: tuple[PoseEstimate, Gray], position: Array
-    ) -> FollowedPosition | None:
+        self, name: str, life: _TargetState, follower: ImageFollower, picture: _Picture,
+        position: Array,
+    ) -> FollowedPosition | None:  # fmt: skip
         """Find a target that was not measured to move yet, if it has left its place (3,); None if
         it is still there, or is not found.
         """
-        (estimate, gray), follower = picture, life.follower
-        if follower is None:
-            return None
+        estimate, gray = picture
         time_ns = estimate.exposure_time_ns
-        left = self._find_departed_moving(life, follower, estimate, gray, position)
+        left = self._find_departed_moving(life, follower, picture, position)
         if left is not None:
             return left if self._moves_steadily(life, left, position, time_ns) else None
         near = follower.find(gray, estimate, position, _STILL_M)
         is_over = time_ns - life.begun_ns > _DEPARTS_S * 1e9
         has_changed = follower.watch(gray, estimate, position)
         if near is None:
-            left = self._find_departed(life, follower, estimate, gray, position)
+            left = self._find_departed(life, follower, picture, position)
             drives = left is not None and self._moves_steadily(life, left, position, time_ns)
             return left if drives else None
         if has_changed:
@@ -348,12 +346,7 @@ class TargetManager:
         return None
 
     def _is_gone(
-        self,
-        name: str,
-        life: _TargetState,
-        follower: ImageFollower,
-        estimate: PoseEstimate,
-        gray: Gray,
+        self, name: str, life: _TargetState, follower: ImageFollower, picture: _Picture
     ) -> bool:
         """Whether a target that was never measured to move ends, because the ground in its place is
         visible.
@@ -361,6 +354,7 @@ class TargetManager:
         If the target only looks different, the operator is told: after a sudden change it may have
         left.
         """
+        estimate, gray = picture
         if life.moved_at_once and follower.shows_ground(gray, estimate):
             self._end_with(AlertId.TARGET_LEFT, name)
             return True
@@ -421,9 +415,10 @@ class TargetManager:
         return replace(fix, visibility=seen, covariance=fix.covariance + level)
 
     def _find_moving(
-        self, life: _TargetState, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
+        self, life: _TargetState, follower: ImageFollower, picture: _Picture
     ) -> FollowedPosition | None:
         """Find a moving target near its predicted position; None if something hides it."""
+        estimate, gray = picture
         time_ns = estimate.exposure_time_ns
         expected = life.track.expected(time_ns)
         if expected is None or life.track.is_being_hidden(estimate, expected[0]):
@@ -432,7 +427,7 @@ class TargetManager:
         reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
         is_long = (time_ns - life.found_ns) * 1e-9 > _LONG_S
         can_tell, found = self._before_ground(
-            life, follower, (estimate, gray), expected[0], reach_m, was_hidden=is_long
+            follower, picture, expected[0], reach_m, was_hidden=is_long
         )
         if not can_tell:
             found = follower.find(gray, estimate, expected[0], reach_m, was_hidden=is_long)
@@ -464,22 +459,21 @@ class TargetManager:
         return back is not None and (time_ns - back.time_ns) * 1e-9 <= _BACK_GAP_S
 
     def _find_departed_moving(
-        self, life: _TargetState, follower: ImageFollower, estimate: PoseEstimate, gray: Gray,
-        position: Array,
-    ) -> FollowedPosition | None:  # fmt: skip
+        self, life: _TargetState, follower: ImageFollower, picture: _Picture, position: Array
+    ) -> FollowedPosition | None:
         """Find a target that moved when it was clicked and now covers other ground; None if it
         stands.
         """
-        since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
+        since_s = (picture[0].exposure_time_ns - life.found_ns) * 1e-9
         if not life.moved_at_once or since_s > _DEPARTS_S:
             return None
         reach_m = _NEAR_M + _FASTEST_MPS * since_s
-        _, found = self._before_ground(life, follower, (estimate, gray), position, reach_m)
+        _, found = self._before_ground(follower, picture, position, reach_m)
         return found if found is not None and _off(found.position, position) >= _STANDS_M else None
 
     def _before_ground(
-        self, life: _TargetState, follower: ImageFollower, picture: tuple[PoseEstimate, Gray],
-        position: Array, reach_m: float, *, was_hidden: bool = False,
+        self, follower: ImageFollower, picture: _Picture, position: Array, reach_m: float,
+        *, was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:  # fmt: skip
         """Whether earlier images can separate the target from the ground; where it is."""
         if not follower.is_isolated:
@@ -494,20 +488,17 @@ class TargetManager:
 
     @staticmethod
     def _find_departed(
-        life: _TargetState,
-        follower: ImageFollower,
-        estimate: PoseEstimate,
-        gray: Gray,
-        position: Array,
+        life: _TargetState, follower: ImageFollower, picture: _Picture, position: Array
     ) -> FollowedPosition | None:
         """Find a clicked target that moves, before its motion was measured. The ground that it has
         left shows its shape. A car that only passes over a clicked place does not take the place's
         appearance along, so no match is found.
         """
+        estimate, gray = picture
         since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
         if since_s > _DEPARTS_S:
             return None
-        if not follower.is_isolated and not follower.isolate(((estimate, gray),)):
+        if not follower.is_isolated and not follower.isolate((picture,)):
             return None
         found = follower.find(gray, estimate, position, _NEAR_M + _FASTEST_MPS * since_s)
         if found is not None and (life.moved_at_once or found.score >= _DEPARTED):
