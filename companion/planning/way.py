@@ -163,7 +163,27 @@ class _Site:
 
     def position(self, place: MissionPlace | RegionOfInterest) -> Array:
         """World position (3,)."""
-        return _position(place, self.cache, self.ground, self.launch)
+        cache = self.cache
+        if place.above is HeightAbove.SEA:
+            height = place.height_m + cache.manifest.geoid_separation_m
+        else:
+            east, north = _enu(place.latitude_deg, place.longitude_deg, cache)
+            is_home = place.above is HeightAbove.HOME
+            below = self.launch if is_home else (east, north)
+            surface = self.ground.height_m(*below)
+            if surface is None:
+                what = "home" if is_home else "a waypoint above terrain"
+                at = cache.frame.position([*below, 0.0])
+                raise MissionFileError(
+                    f"{what} at {at.latitude_deg:.6f}, {at.longitude_deg:.6f} is not over the map "
+                    f"{cache.path} ({_extent(cache, below)}), so nobody knows how high its ground "
+                    "is: plan it over the map, or with altitudes above mean sea level"
+                )
+            # Above the ellipsoid, not above the map's plane: that falls away by 8 m in 10 km.
+            height = cache.frame.position([*below, surface]).height_m + place.height_m
+        return np.asarray(
+            cache.frame.enu_from_geodetic(place.latitude_deg, place.longitude_deg, height)
+        )
 
 
 class _Legs:
@@ -253,36 +273,6 @@ def _enu(latitude_deg: float, longitude_deg: float, cache: TileCache) -> tuple[f
     height = cache.frame.origin.height_m
     east, north, _ = cache.frame.enu_from_geodetic(latitude_deg, longitude_deg, height)
     return float(east), float(north)
-
-
-def _position(
-    waypoint: MissionPlace | RegionOfInterest,
-    cache: TileCache,
-    ground: MapHeights,
-    home: tuple[float, float],
-) -> Array:
-    """World position (3,) of a place."""
-    if waypoint.above is HeightAbove.SEA:
-        height = waypoint.height_m + cache.manifest.geoid_separation_m
-        return np.asarray(
-            cache.frame.enu_from_geodetic(waypoint.latitude_deg, waypoint.longitude_deg, height)
-        )
-    east, north = _enu(waypoint.latitude_deg, waypoint.longitude_deg, cache)
-    below = home if waypoint.above is HeightAbove.HOME else (east, north)
-    surface = ground.height_m(*below)
-    if surface is None:
-        what = "home" if waypoint.above is HeightAbove.HOME else "a waypoint above terrain"
-        place = cache.frame.position([*below, 0.0])
-        raise MissionFileError(
-            f"{what} at {place.latitude_deg:.6f}, {place.longitude_deg:.6f} is not over the map "
-            f"{cache.path} ({_extent(cache, below)}), so nobody knows how high its ground is: plan "
-            "it over the map, or with altitudes above mean sea level"
-        )
-    # Above the ellipsoid, not above the map's plane: that falls away by 8 m in 10 km.
-    height = cache.frame.position([*below, surface]).height_m + waypoint.height_m
-    return np.asarray(
-        cache.frame.enu_from_geodetic(waypoint.latitude_deg, waypoint.longitude_deg, height)
-    )
 
 
 def _extent(cache: TileCache, below: tuple[float, float]) -> str:
