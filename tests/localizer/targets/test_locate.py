@@ -73,7 +73,7 @@ def test_the_shares_of_an_edge_are_those_of_monte_carlo():
     pixel = _pixel_of(NADIR, (9.6, 3.0, 8.0))
     sigma = np.sqrt(estimate.covariance.diagonal())
     heights = []
-    for _ in range(2000):
+    for _ in range(500):
         e = rng.normal(0, sigma)
         moved = Pose(so3_exp(e[3:]) @ NADIR.rotation, NADIR.translation + e[:3])
         at = (pixel[0] + rng.normal(0, 1.5), pixel[1] + rng.normal(0, 1.5))
@@ -102,7 +102,7 @@ def test_covariance_agrees_with_monte_carlo(tilt_deg):
     rng = np.random.default_rng(0)
     sigma = np.sqrt(estimate.covariance.diagonal())
     hits = []
-    for _ in range(4000):
+    for _ in range(2000):
         e = rng.normal(0, sigma)
         moved = Pose(so3_exp(e[3:]) @ pose.rotation, pose.translation + e[:3])
         hits.append(_ground_hit(moved, tuple(np.add(pixel, rng.normal(0, 2.0, 2)))))
