@@ -28,7 +28,8 @@ from localizer.geometry.pose import Array
 from localizer.types import PoseEstimate, TargetFix
 
 _log = logging.getLogger(__name__)
-_Key, _Value = TypeVar("_Key"), TypeVar("_Value")
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 _QUEUE = 512  # packets: seconds of video
 _KEPT = 64  # exposures, estimates, targets
 _TARGET_NS = 1_000_000_000  # a target that was seen so near to a picture is the picture's
