@@ -81,9 +81,10 @@ def test_a_folder_goes_on_from_its_first_prior_and_tells_what_it_could_not_use(
     for name in ("000000.jpg", "000001.jpg", "000002.jpg", "000003.jpg", "timestamps.txt"):
         shutil.copy(small_sequence / "images" / name, folder)
     (folder / "000001.jpg").write_bytes(b"no image")
-    for name, counts in (("000002.jpg", 1), ("000003.jpg", np.uint16(9))):  # thermal cameras
-        grey = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) * counts
-        (folder / name).write_bytes(cv2.imencode(".png", grey)[1].tobytes())
+    for name, counts in (("000002.jpg", 1), ("000003.jpg", 9)):  # thermal cameras
+        grey = np.asarray(cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE), np.uint16) * counts
+        kept = grey if counts > 1 else grey.astype(np.uint8)
+        (folder / name).write_bytes(cv2.imencode(".png", kept)[1].tobytes())
     row = read_poses(small_sequence / "poses.txt")[0]
     out = tmp_path / "out"
     result = _run(folder, *_common(small_assets, small_sequence, out), "--prior", _off(row, 3))
