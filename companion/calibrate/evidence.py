@@ -2,24 +2,27 @@
 
 Images: pixels of the map's points. Autopilot: attitude (through the gimbal) and position, at the
 timestamp minus the time offset. All frames are evaluated at once, so derivatives are finite
-differences: 25 evaluations of some milliseconds.
+differences: 25 evaluations of some milliseconds. The autopilot's data around each exposure
+are kept for any time offset.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.autopilot_window import AutopilotWindow, at_offset
 from companion.calibrate.pictures import Parts
-from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, so3_exp, so3_log
+from mavlink_bridge.messages import Attitude, GimbalAttitude
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Guess:
 
 class CalibrationProblem:
     """Observations of K frames with N patches in all, relative to a deployment's camera model,
-    mount (3, 3) and lever arm arm_m (3,).
+    mount (3, 3) and lever arm arm_m (3,). start: the deployment's values and the recorded poses.
     """
 
     def __init__(
@@ -72,16 +75,11 @@ class CalibrationProblem:
         self.placed: NDArray[np.bool_] = np.array([f.window.has_place for f in frames])
         heights = self._place[:, self._place.shape[1] // 2, 2]
         self._ground_m = float(np.nanmin(heights)) if self.placed.any() else 0.0
-        self._start = Guess(
+        self.start = Guess(
             np.zeros(u.COUNT),
             np.array([f.pose.rotation for f in frames]),
             np.array([f.pose.translation for f in frames]),
         )
-
-    @property
-    def start(self) -> Guess:
-        """The deployment's values and the recorded poses."""
-        return self._start
 
     @property
     def grounds(self) -> Array:
@@ -91,15 +89,11 @@ class CalibrationProblem:
         middles: Array = np.add.reduceat(self._points[:, :2], begins, axis=0) / counts[:, None]
         return middles
 
-    def camera_of(self, shared: Array) -> Camera:
-        """The deployment's camera model with these corrections (COUNT,)."""
-        return changed_camera(self._camera, shared)
-
     def pixel_residuals(self, guess: Guess) -> Array:
         """(N, 2): predicted minus measured, weighted by each patch's information, px."""
         away = self._points - guess.places[self.owner]
         x, y, z = np.einsum("nji,nj->in", guess.rotations[self.owner], away)
-        c = self.camera_of(guess.shared)
+        c = changed_camera(self._camera, guess.shared)
         xd, yd = c.distorted(x / z, y / z)
         off = np.stack([c.fx * xd + c.cx, c.fy * yd + c.cy], axis=1) - self._pixels
         weighted: Array = np.einsum("nij,nj->ni", self._root, off)
@@ -138,3 +132,92 @@ def changed_camera(camera: Camera, shared: Array) -> Camera:
         camera, fx=camera.fx * scale, fy=camera.fy * scale, cx=camera.cx + float(right),
         cy=camera.cy + float(down), distortion=tuple(float(k) for k in bent),
     )  # fmt: skip
+
+
+REACH_S = 0.4  # to both sides of the stamp: offsets beyond it are not looked for
+_STEP_S = 0.02
+OFFSETS_S: Array = np.arange(-REACH_S, REACH_S + 1e-9, _STEP_S)
+
+
+class AutopilotRecord(Protocol):
+    """A record's telemetry at any time; None if unknown."""
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """The vehicle's attitude at a CLOCK_MONOTONIC time."""
+        ...
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a time."""
+        ...
+
+    def global_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's latitude, longitude and altitude AMSL at a time."""
+        ...
+
+
+@dataclass(frozen=True)
+class AutopilotWindow:
+    """Autopilot data around one timestamp, at T times `OFFSETS_S` from it; NaN if unknown.
+
+    camera: (T, 3, 3) world from the camera's housing (gimbal axes, x along the boresight), without
+    the deployment's mounting correction; body: (T, 3, 3) world from body; place: (T, 3) position by
+    the EKF, map ENU, m.
+    """
+
+    camera: Array
+    body: Array
+    place: Array
+
+    @property
+    def has_place(self) -> bool:
+        """Whether the EKF's position is known at all T times."""
+        return bool(np.isfinite(self.place).all())
+
+    def motion(self, offset_s: float = 0.0) -> tuple[Array, Array]:
+        """Angular rate of the camera, rad/s, and the vehicle's velocity, m/s (0 if unknown), world
+        axes (3,) each, at an offset within `REACH_S`; beyond it, at the window's end.
+        """
+        n = 3
+        middle = round((offset_s + REACH_S) / _STEP_S)
+        middle = min(max(middle, n), len(OFFSETS_S) - 1 - n)
+        seconds = 2 * n * _STEP_S
+        a, b = self.camera[middle - n], self.camera[middle + n]
+        way = self.place[middle + n] - self.place[middle - n]
+        return so3_log(b @ a.T) / seconds, np.nan_to_num(way / seconds)
+
+
+def autopilot_window_at(
+    autopilot: AutopilotRecord, time_ns: int, frame: LocalFrame, geoid_m: float, mount: Array
+) -> AutopilotWindow | None:
+    """The window around a timestamp; None if attitude or gimbal is unknown at one of its times.
+
+    mount: (3, 3), the deployment's mounting angles. The angles of `gimbal_at` contain them already.
+    """
+    camera, body, place = [], [], []
+    for offset_s in OFFSETS_S:
+        t = time_ns + round(1e9 * offset_s)
+        attitude, gimbal, where = (
+            autopilot.attitude_at(t), autopilot.gimbal_at(t), autopilot.global_at(t)
+        )  # fmt: skip
+        if attitude is None or gimbal is None:
+            return None
+        if where is None:
+            enu, to_ned = np.full(3, np.nan), ned_from_world(frame, frame.origin)
+        else:
+            enu = np.asarray(frame.enu_from_geodetic(where[0], where[1], where[2] + geoid_m))
+            to_ned = ned_from_world(frame, frame.position(enu))
+        camera.append(to_ned.T @ matrix_from_quaternion(gimbal.quaternion) @ mount.T)
+        body.append(to_ned.T @ matrix_from_quaternion(attitude.quaternion))
+        place.append(enu)
+    return AutopilotWindow(np.array(camera), np.array(body), np.array(place))
+
+
+def at_offset(values: Array, offset_s: float) -> Array:
+    """Values (K, T, ...) of K timestamps at one offset, linearly interpolated: (K, ...). Beyond
+    `REACH_S`, those of the window's end.
+    """
+    where = np.clip((offset_s + REACH_S) / _STEP_S, 0.0, len(OFFSETS_S) - 1.001)
+    i = int(where)
+    t = where - i
+    between: Array = (1.0 - t) * values[:, i] + t * values[:, i + 1]
+    return between

@@ -9,11 +9,18 @@ from functools import partial
 import numpy as np
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.autopilot_window import REACH_S, AutopilotWindow, autopilot_window_at
-from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, Guess, changed_camera
+from companion.calibrate.evidence import (
+    REACH_S,
+    AutopilotWindow,
+    CalibrationFrame,
+    CalibrationProblem,
+    Guess,
+    autopilot_window_at,
+    changed_camera,
+)
 from companion.calibrate.pictures import PictureReader
 from companion.calibrate.solve import Solution, solve
-from companion.config import CompanionConfig, FeedConfig
+from companion.config import CompanionConfig
 from companion.errors import RecordError, StreamDecodeError
 from companion.geometry import Mount
 from companion.offline.autopilot import RecordedAutopilot
@@ -177,7 +184,8 @@ def _chosen(
         time_ns = estimate.exposure_time_ns
         autopilot.advance(time_ns + _LATER_NS)
         window = autopilot_window_at(autopilot, time_ns, frame, geoid_m, mount)
-        if window is None or not _unzoomed(config.camera, autopilot, time_ns):
+        factor = autopilot.zoom_factor(config.camera.zoom, time_ns)
+        if window is None or factor is None or abs(factor - 1.0) > _SAME_LENS:
             continue
         state = autopilot.state()
         if not trusted or not gnss_healthy(state, time_ns + _LATER_NS):
@@ -207,15 +215,6 @@ def _read(picture: _ChosenFrame, camera: Camera) -> Frame | None:
         return picture.recorded.load(camera, picture.time_ns)
     except StreamDecodeError:
         return None
-
-
-def _unzoomed(camera: FeedConfig, autopilot: RecordedAutopilot, time_ns: int) -> bool:
-    """Whether an image was taken with the model's focal length, as far as it is recorded."""
-    if camera.zoom is None:
-        return True
-    level = autopilot.zoom_at(time_ns, camera.zoom.hold_s)
-    factor = None if level is None else camera.zoom.factor(level)
-    return factor is not None and abs(factor - 1.0) <= _SAME_LENS
 
 
 def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from companion.calibrate.views import BoardView
+from companion.calibrate.board import BoardView
 from companion.errors import RecordError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -41,34 +41,19 @@ def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstim
             "better 16: all over the picture, near, and tilted"
         )
     used = list(views)
-    fitted = _fit(used, (width, height), with_k3=False)
-    limit = _OUTLIER * float(np.median(fitted.errors))
-    kept = [v for v, e in zip(used, fitted.errors, strict=True) if e <= limit]
+    lens, errors = _fit(used, (width, height), with_k3=False)
+    kept = [v for v, e in zip(used, errors, strict=True) if e <= _OUTLIER * np.median(errors)]
     if _LEAST_VIEWS <= len(kept) < len(used):
-        used, fitted = kept, _fit(kept, (width, height), with_k3=False)
-    more = _fit(used, (width, height), with_k3=True)
-    if more.rms < _K3_GAIN * fitted.rms:
-        fitted = more
-    K, d = fitted.K, fitted.distortion
-    camera = Camera(
-        width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]),
-        (float(d[0]), float(d[1]), float(d[2]), float(d[3]), float(d[4])),
-    )  # fmt: skip
-    return LensEstimate(camera, _SIGMA_FACTOR * fitted.sigmas, fitted.rms, (len(used), len(views)))
+        used, lens = kept, _fit(kept, (width, height), with_k3=False)[0]
+    more, _ = _fit(used, (width, height), with_k3=True)
+    found = more if more.rms_px < _K3_GAIN * lens.rms_px else lens
+    return replace(found, views=(len(used), len(views)))
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Result of OpenCV. errors: (N,) px of each view."""
-
-    K: Array
-    distortion: Array
-    sigmas: Array
-    errors: Array
-    rms: float
-
-
-def _fit(views: Sequence[BoardView], size: tuple[int, int], *, with_k3: bool) -> _Fit:
+def _fit(
+    views: Sequence[BoardView], size: tuple[int, int], *, with_k3: bool
+) -> tuple[LensEstimate, Array]:
+    """The camera model, and the error of each view, (N,) px."""
     objects = [v.objects.astype(np.float32) for v in views]
     # Corners count from the picture's edge here, so the principal point does, too.
     pixels = [v.pixels.astype(np.float32) for v in views]
@@ -76,8 +61,9 @@ def _fit(views: Sequence[BoardView], size: tuple[int, int], *, with_k3: bool) ->
     rms, K, d, _, _, sigmas, _, errors = cv2.calibrateCameraExtended(
         objects, pixels, size, np.eye(3), np.zeros(5), flags=flags
     )
-    flat = np.asarray(sigmas, np.float64).ravel()[:9]
-    return _Fit(
-        np.asarray(K, np.float64), np.asarray(d, np.float64).ravel()[:5], flat,
-        np.asarray(errors, np.float64).ravel(), float(rms),
-    )  # fmt: skip
+    k1, k2, p1, p2, k3 = map(float, np.ravel(d)[:5])
+    camera = Camera(
+        *size, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), (k1, k2, p1, p2, k3)
+    )
+    wide = _SIGMA_FACTOR * np.asarray(sigmas, np.float64).ravel()[:9]
+    return LensEstimate(camera, wide, float(rms), (len(views),) * 2), np.ravel(errors)

@@ -42,99 +42,69 @@ def setting_changes(config: CompanionConfig, found: CalibrationResult) -> tuple[
     """All settings of the flown deployment `config` whose value the flight's estimate changes. They
     were estimated together and must be replaced together.
     """
-    s, told = found.shared, config.camera.model
+    s, sigma, told = found.shared, found.sigmas, config.camera.model
     camera = changed_camera(found.camera, s)
     size = told.camera().resized(found.camera.width, found.camera.height)
     camera = camera if size == told.camera() else camera.resized(told.width, told.height)
-    made = [
-        SettingChange(
-            ("camera", "model", name), getattr(told, name), round(getattr(camera, name), 3)
-        )
-        for name in ("fx", "fy", "cx", "cy")
-    ]
-    made.append(
-        SettingChange(
-            ("camera", "model", "distortion"),
-            list(told.distortion), [round(k, 5) for k in camera.distortion],
-        )
-    )  # fmt: skip
-    feed = config.camera.settings
-    late_ms = feed.time_offset_ms + 1e3 * float(s[u.LATE])
-    made.append(
-        SettingChange(
-            ("camera", "settings", "time_offset_ms"), feed.time_offset_ms, round(late_ms, 1)
-        )
-    )
-    made += _mounting(config, found)
-    arm = [round(float(x), 3) for x in found.arm_m + s[u.ARM]]
-    made.append(SettingChange(("camera", "lever_arm_m"), list(config.camera.lever_arm_m), arm))
-    made += _sigmas(config, found)
-    return tuple(c for c in made if c.before != c.after)
-
-
-def _mounting(config: CompanionConfig, found: CalibrationResult) -> list[SettingChange]:
-    mount = found.mount @ so3_exp(found.shared[u.MOUNT])
-    angles = np.degrees(euler_from_matrix(mount))
-    c = config.bridge.camera
+    late_ms = config.camera.settings.time_offset_ms + 1e3 * float(s[u.LATE])
+    angles = np.degrees(euler_from_matrix(found.mount @ so3_exp(s[u.MOUNT])))
     names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
-    return [
-        SettingChange(("bridge", "camera", name), getattr(c, name), round(float(angle), 3))
-        for name, angle in zip(names, angles, strict=True)
-    ]
-
-
-def _sigmas(config: CompanionConfig, found: CalibrationResult) -> list[SettingChange]:
-    """The new sigmas of the camera model."""
-    sigma = found.sigmas
-    told = config.localizer.calibration
-    values = {
-        "focal_percent": 100.0 * sigma[u.FOCAL],
-        "principal_percent": 100.0 * float(sigma[u.CENTRE].max()) / found.camera.width,
-        "distortion": float(sigma[u.BEND][0]),
-        "stamp_ms": float(np.hypot(1e3 * sigma[u.LATE], _JITTER_MS)),
-    }
-    return [
-        SettingChange(
-            ("localizer", "calibration", name), getattr(told, name),
-            round(max(float(value), _LEAST[name]), 4),
-        )
-        for name, value in values.items()
-    ]  # fmt: skip
+    made = _changes(config, {
+        **{("camera", "model", n): round(getattr(camera, n), 3) for n in ("fx", "fy", "cx", "cy")},
+        ("camera", "model", "distortion"): [round(k, 5) for k in camera.distortion],
+        ("camera", "settings", "time_offset_ms"): round(late_ms, 1),
+        **{("bridge", "camera", n): round(float(a), 3) for n, a in zip(names, angles, strict=True)},
+        ("camera", "lever_arm_m"): [round(float(x), 3) for x in found.arm_m + s[u.ARM]],
+        **_sigmas(
+            focal_percent=100.0 * sigma[u.FOCAL],
+            principal_percent=100.0 * sigma[u.CENTRE].max() / found.camera.width,
+            distortion=sigma[u.BEND][0],
+            stamp_ms=np.hypot(1e3 * sigma[u.LATE], _JITTER_MS),
+        ),
+    })  # fmt: skip
+    return tuple(c for c in made if c.before != c.after)
 
 
 def lens_changes(config: CompanionConfig | None, lens: LensEstimate) -> tuple[SettingChange, ...]:
     """All settings that a board calibration gives, changed or not. config: None if there is no
     deployment yet; `before` is then None.
     """
-    model = None if config is None else config.camera.model
-    told = None if config is None else config.localizer.calibration
     c = lens.camera
     values: dict[str, Any] = {
         "width": c.width, "height": c.height,
         **{name: round(getattr(c, name), 2) for name in ("fx", "fy", "cx", "cy")},
         "distortion": [round(k, 5) for k in c.distortion],
     }  # fmt: skip
-    if model is not None and model.distortion_model != c.distortion_model:
+    if config is not None and config.camera.model.distortion_model != c.distortion_model:
         values["distortion_model"] = c.distortion_model
-    made = [
-        SettingChange(
-            ("camera", "model", name), None if model is None else getattr(model, name), value
-        )
+    sigmas = _sigmas(
+        focal_percent=100.0 * lens.sigmas[0] / c.fx,
+        principal_percent=100.0 * lens.sigmas[2:4].max() / c.width,
+        distortion=lens.sigmas[4],
+    )
+    return _changes(config, {("camera", "model", k): v for k, v in values.items()} | sigmas)
+
+
+def _sigmas(**values: float) -> dict[tuple[str, ...], float]:
+    """Sigmas of the camera model by key, none below what the deployment allows."""
+    return {
+        ("localizer", "calibration", name): round(max(float(value), _LEAST[name]), 4)
         for name, value in values.items()
-    ]
-    sigmas = {
-        "focal_percent": 100.0 * float(lens.sigmas[0]) / c.fx,
-        "principal_percent": 100.0 * float(lens.sigmas[2:4].max()) / c.width,
-        "distortion": float(lens.sigmas[4]),
     }
-    made += [
-        SettingChange(
-            ("localizer", "calibration", name), None if told is None else getattr(told, name),
-            round(max(value, _LEAST[name]), 4),
-        )
-        for name, value in sigmas.items()
-    ]  # fmt: skip
-    return tuple(made)
+
+
+def _changes(
+    config: CompanionConfig | None, after: dict[tuple[str, ...], Any]
+) -> tuple[SettingChange, ...]:
+    document = None if config is None else config.model_dump()
+    return tuple(SettingChange(key, _value(document, key), value) for key, value in after.items())
+
+
+def _value(document: Any, key: tuple[str, ...]) -> Any:
+    """The setting of a deployment, a tuple as a list; None without a deployment."""
+    for name in key if document is not None else ():
+        document = document[name]
+    return list(document) if isinstance(document, tuple) else document
 
 
 def apply_changes(config: CompanionConfig, wanted: tuple[SettingChange, ...]) -> CompanionConfig:
@@ -161,10 +131,7 @@ def require_flown_with(path: Path, wanted: tuple[SettingChange, ...]) -> None:
     """
     document = load_config(path).model_dump()
     for change in wanted:
-        told = document
-        for name in change.key:
-            told = told[name]
-        now = list(told) if isinstance(told, tuple) else told
+        now = _value(document, change.key)
         if now not in (change.before, change.after):
             raise ConfigError(
                 f"{path}: {'.'.join(change.key)} is {now}, the record was flown with "

@@ -18,7 +18,6 @@ import sys
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperGroup
 
@@ -36,6 +35,7 @@ from companion.cli.interrupts import INTERRUPTED
 from companion.cli.key import key_command
 from companion.cli.localize import localize_command
 from companion.cli.map import app as map_app
+from companion.cli.output import tell
 from companion.cli.replay import replay_command
 from companion.cli.report import report_command
 from companion.cli.run import run_command
@@ -118,5 +118,5 @@ def main() -> None:
     except (CompanionError, LocalizerError, BridgeError, OSError) as error:
         # Escaped: a path or a value in the text may look like the console's markup.
         name, text = type(error).__name__, escape(str(error))
-        Console(stderr=True).print(f"[bold red]{name}[/]: {text}", soft_wrap=True, highlight=False)
+        tell(f"[bold red]{name}[/]: {text}", err=True)
         sys.exit(2)

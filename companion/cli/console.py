@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
+from companion.cli.output import tell
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.live.config import ConsoleConfig
@@ -40,10 +40,7 @@ def console_command(
     # The flight is met by the deployment's own address, whatever this page listens on.
     meeting = given.listen
     if listen is not None:
-        try:
-            given = validated(ConsoleConfig, given.model_dump() | {"listen": listen})
-        except SettingsError as error:
-            raise ConfigError(f"--listen {listen}: {str(error).strip()}") from error
+        given = listening("--listen", listen, given)
     os.setpriority(os.PRIO_PROCESS, 0, min(os.getpriority(os.PRIO_PROCESS, 0) + _NICE, _LOWEST))
     if lifeline:
         threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()
@@ -61,6 +58,15 @@ def console_command(
     serve(ConsoleSite(given, source, settings.map, records, config.absolute(), token))
 
 
+def listening(option: str, listen: str, given: ConsoleConfig | None = None) -> ConsoleConfig:
+    """The settings with another address:port; `ConfigError` names the option that gave it."""
+    settings = {} if given is None else given.model_dump()
+    try:
+        return validated(ConsoleConfig, settings | {"listen": listen})
+    except SettingsError as error:
+        raise ConfigError(f"{option} {listen}: {str(error).strip()}") from error
+
+
 def require_extra() -> None:
     """`ConfigError` if the packages of the extra `console` are not installed."""
     try:
@@ -74,10 +80,7 @@ def serve(site: ConsoleSite) -> None:
     """Serve the page until interrupted. Prints the address once the page can be opened."""
     from companion.console.serving import Server
 
-    def tell() -> None:
-        Console().print(f"console: [green]{site.config.url}[/]", soft_wrap=True, highlight=False)
-
-    server = Server(site, tell)
+    server = Server(site, lambda: tell(f"console: [green]{site.config.url}[/]"))
     with console_log(verbose=False):
         server.run()
 

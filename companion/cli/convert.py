@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
-from companion.cli.geographic import numbers
+from companion.cli.before.shared_options import numbers
+from companion.cli.output import tell_notes
 from companion.errors import ConfigError
 from companion.terminal.steps import show_work
 from companion.writing import refuse_input, writing
@@ -68,8 +68,7 @@ def convert_command(
         poses = _dated(READERS[of](source, place), times, needed=to == "tum")
         with writing(out):
             WRITERS[to](out, poses, place)
-    for note in notes:
-        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
+    tell_notes(notes)
     typer.echo(f"{out}: {len(poses)} poses")
 
 

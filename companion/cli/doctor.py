@@ -19,6 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from companion.cli.output import show_table, tell
 from companion.config import load_config
 from companion.terminal.steps import show_steps, show_work
 from companion.versions import made_by, processor
@@ -77,7 +78,7 @@ def doctor_command(
 
         made = make_sheet(config, settings, diagnosis, plan, datetime.now(timezone.utc))
         html, text = write_sheet(made, page)
-        console.print(f"to sign: {html}, {text}", soft_wrap=True, highlight=False)
+        tell(f"to sign: {html}, {text}")
     raise typer.Exit(diagnosis.exit_code)
 
 
@@ -120,21 +121,20 @@ def self_test_command(
         result_file(out, "--out", (".json",))
     from companion.preflight.self_test import self_test
 
-    console, told = Console(), Console(stderr=True)
     rows: list[BenchRow] = []
     with tempfile.TemporaryDirectory(prefix="companion-self-test-") as folder:
         report = self_test(
             Path(folder),
-            lambda line: told.print(f"{line} ..."),
+            lambda line: tell(f"{line} ...", err=True),
             timed=rows.append if bench else None,
         )
-    console.print(
+    tell(
         f"[green]self-test passed[/]: tracked to {report.error_m:.4f} m, found to "
         f"{report.found_error_m:.4f} m, {report.frame_ms:.0f} ms of processor a frame, the first "
         f"after {report.compiled_s:.0f} s"
     )
     if rows:
-        console.print(_speed_table(rows, report.features))
+        _show_speed(rows, report.features)
     if out is not None:
         data = asdict(report) | {"versions": made_by()}
         if rows:
@@ -142,14 +142,12 @@ def self_test_command(
         write_result(out, json.dumps(data, indent=1) + "\n", "--out")
 
 
-def _speed_table(rows: Sequence[BenchRow], features: str) -> Table:
-    table = Table(title=f"{processor()}; {features}")
-    for name in ("offered, Hz", "answered, Hz", "latency p50 / p95, ms", "processor, ms a frame",
-                 "cores", "peak memory, MiB"):  # fmt: skip
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(
-            str(row.offered_hz), f"{row.answered_hz:.1f}", f"{row.p50_ms:.0f} / {row.p95_ms:.0f}",
-            f"{row.cpu_ms:.1f}", f"{row.cores:.2f}", f"{row.peak_mib:.0f}",
-        )  # fmt: skip
-    return table
+def _show_speed(rows: Sequence[BenchRow], features: str) -> None:
+    names = ("offered, Hz", "answered, Hz", "latency p50 / p95, ms", "processor, ms a frame",
+             "cores", "peak memory, MiB")  # fmt: skip
+    cells = [
+        (str(row.offered_hz), f"{row.answered_hz:.1f}", f"{row.p50_ms:.0f} / {row.p95_ms:.0f}",
+         f"{row.cpu_ms:.1f}", f"{row.cores:.2f}", f"{row.peak_mib:.0f}")
+        for row in rows
+    ]  # fmt: skip
+    show_table(names, cells, f"{processor()}; {features}", names)

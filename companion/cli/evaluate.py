@@ -15,10 +15,10 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
 from companion.cli.before.shared_options import Device, FeatureNetwork, Renderer, WorkingWidth
+from companion.cli.output import show_table, tell, tell_notes
 from companion.errors import ConfigError
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import sequence_of
@@ -128,8 +128,7 @@ def evaluate_command(
             notes = list(flight.notes)
             if not data.is_timed and prior != "each":
                 notes.append(f"{sequence}: its times do not increase: 30 frames/s assumed")
-            for note in notes:
-                Console(stderr=True).print(escape(note), style="yellow")
+            tell_notes(notes)
             localizer = build_localizer(stack, data.camera, config, sensors.auxiliary(data))
             known = None
             if searched:
@@ -167,7 +166,7 @@ def evaluate_command(
         finally:
             stack.close()
     page = write_page(report)
-    Console().print("report:", file_link(page), soft_wrap=True, highlight=False)
+    tell(Text.assemble("report: ", file_link(page)))
 
 
 @contextmanager
@@ -187,32 +186,27 @@ def place_finder(
 
 def _print_problems(frames: list[EvaluatedFrame]) -> None:
     problems = [f.problem for f in frames if f.problem]
-    console = Console(stderr=True)
-    for text in problems[:_PROBLEMS]:
-        console.print(escape(text), style="yellow", soft_wrap=True, highlight=False)
+    tell_notes(problems[:_PROBLEMS])
     if len(problems) > _PROBLEMS:
-        console.print(f"... {len(problems) - _PROBLEMS} more: see frames.csv", style="yellow")
+        tell_notes([f"... {len(problems) - _PROBLEMS} more: see frames.csv"])
 
 
 def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
     """Print the columns of the paper's Table 2, with the number of unusable images."""
-    caption = "medians of localized frames; recalls and completeness of all"
     m = metrics
-    table = Table(title=title, caption=caption)
-    for column in ("frames", "unusable", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS"):
-        table.add_column(column, justify="right")
-    table.add_row(
+    columns = ("frames", "unusable", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS")
+    row = (
         str(m.frames), str(unusable),
         _text(m.median_translation_m, 2), _text(m.median_rotation_deg, 3),
         f"{m.recall_1:.1f}", f"{m.recall_3:.1f}", f"{m.recall_5:.1f}",
         f"{m.completeness:.1f}", f"{m.fps:.1f}",
     )  # fmt: skip
-    Console().print(table)
-    Console().print(
+    show_table(columns, [row], title, columns)
+    tell("medians of localized frames; recalls and completeness of all")
+    tell(
         f"p95 {_text(m.p95_translation_m, 2)} m {_text(m.p95_rotation_deg, 3)}°, "
         f"maximum {_text(m.max_translation_m, 2)} m {_text(m.max_rotation_deg, 3)}° "
-        "of localized frames",
-        highlight=False,
+        "of localized frames"
     )
 
 

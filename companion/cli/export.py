@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from companion.cli.before.shared_options import RecordMap, RecordTlog
+from companion.cli.output import tell
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count, show_steps, tally
 from companion.writing import result_file
@@ -30,17 +31,16 @@ def export_command(
     """Write a record in a format that other programs open."""
     if not mcap:
         raise ConfigError("say which format: --mcap, the only one so far; the .tlog needs none")
-    console = Console()
     with show_steps(Console(stderr=True)) as say:
         say(f"reading {record}")
         from companion.export.mcap_export import export_mcap
 
         written = export_mcap(record, out, tlog, lambda n: say(f"{n} rows written"))
     for note in written.notes:
-        console.print(f"note: {escape(note)}", soft_wrap=True, highlight=False)
+        tell(f"note: {escape(note)}")
     told = f"{written.messages} messages of {written.rows} rows, pictures and MAVLink messages"
     path = escape(str(written.path))
-    console.print(f"{told}: [green]{path}[/]", soft_wrap=True, highlight=False)
+    tell(f"{told}: [green]{path}[/]")
 
 
 def klv_command(
@@ -67,8 +67,7 @@ def klv_command(
             video, record, path, map_cache=map_cache, begin_s=begin, mission=mission,
             progress=tally(show),
         )  # fmt: skip
-    Console().print(
+    tell(
         f"{written.described} of {written.pictures} pictures described: "
-        f"[green]{escape(str(path))}[/]",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
+        f"[green]{escape(str(path))}[/]"
+    )

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from companion.cli.output import tell
 from companion.errors import ConfigError
 from companion.terminal.steps import show_work
 from companion.writing import writing
@@ -29,28 +30,26 @@ def key_command(
             Endpoint.parse(install)
         except EndpointError as error:
             raise ConfigError(f"--install {install}: {error}") from error
-    console = Console()
     if not file.exists():
         with writing(file):
             create_key(file)
-        console.print(f"{file}: made; keep a copy, and keep it from others", soft_wrap=True)
+        tell(f"{file}: made; keep a copy, and keep it from others")
     elif install is None:
         raise ConfigError(f"{file}: is there already and not overwritten; give another name")
     if install is not None:
         from mavlink_bridge.preflight.signing_setup import install_key
 
-        console.print("the key goes over this connection in clear: use a cable", soft_wrap=True)
+        tell("the key goes over this connection in clear: use a cable")
         with show_work(Console(stderr=True), f"waiting for the flight controller at {install}"):
             installed = install_key(install, file)
         if installed:
-            console.print("installed: the autopilot's heartbeat is signed with it")
+            tell("installed: the autopilot's heartbeat is signed with it")
         else:
-            console.print(
+            tell(
                 "[yellow]sent, not confirmed[/]: no signed heartbeat came. ArduPilot's USB port "
-                "stays unsigned (check on the companion's port); or another key is in force",
-                soft_wrap=True,
+                "stays unsigned (check on the companion's port); or another key is in force"
             )
-    console.print(f"deployment: bridge.signing: {{key_file: {file}}}", soft_wrap=True)
-    console.print(
+    tell(f"deployment: bridge.signing: {{key_file: {file}}}")
+    tell(
         "ground stations need the same key before they connect: docs/reference/messages.md, Signing"
     )

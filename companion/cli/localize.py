@@ -10,10 +10,15 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.markup import escape
 
-from companion.cli.before.shared_options import Device, FeatureNetwork, Renderer, WorkingWidth
-from companion.cli.geographic import numbers
+from companion.cli.before.shared_options import (
+    Device,
+    FeatureNetwork,
+    Renderer,
+    WorkingWidth,
+    numbers,
+)
+from companion.cli.output import tell_notes
 from companion.errors import ConfigError
 from companion.offline.localize import (
     LocalizedImage,
@@ -136,10 +141,7 @@ def _row(name: str, prior: str) -> PoseRow:
 
 def _print(found: Sequence[LocalizedImage], frame: LocalFrame) -> int:
     """Print the position of a single image, or how many of several were localized."""
-    for image in found:
-        if image.problem:
-            text = escape(f"{image.name}: {image.problem}")
-            Console(stderr=True).print(text, style="yellow", soft_wrap=True, highlight=False)
+    tell_notes(f"{image.name}: {image.problem}" for image in found if image.problem)
     estimates = [i.estimate for i in found if i.estimate is not None and i.estimate.accepted]
     if len(found) == 1 and estimates:
         position, sigma = (

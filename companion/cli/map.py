@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
+from companion.cli.output import show_table, tell, tell_warnings
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
 from companion.writing import result_file, write_result, writing
@@ -154,17 +154,16 @@ def build(
                 name=name,
             )
     except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted: the same command goes on with what is done")
+        tell("interrupted: the same command goes on with what is done", err=True)
         raise
-    Console().print(
+    tell(
         f"[green]{escape(str(out))}[/] from {escape(manifest.source)}: {manifest.tiles} tiles, "
         f"{manifest.triangles} triangles, {manifest.gsd_m:.3f} m texels, "
-        f"{manifest.bytes / 1e6:.1f} MB",
-        soft_wrap=True,
+        f"{manifest.bytes / 1e6:.1f} MB"
     )
     if manifest.skipped:
-        Console().print(f"[yellow]{len(manifest.skipped)} source tiles were left out")
-    _print_warnings(manifest.warnings)
+        tell(f"[yellow]{len(manifest.skipped)} source tiles were left out")
+    tell_warnings(manifest.warnings)
     if overview:
         _make_overview(out)
 
@@ -206,11 +205,6 @@ def _with_ground(
                 write_flat_ground(source[0], ground_m, ground, rules)
             source = [*source, ground]
         yield source
-
-
-def _print_warnings(warnings: Iterable[str]) -> None:
-    for text in warnings:
-        Console().print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
 
 
 @app.command("info")
@@ -256,18 +250,14 @@ def info(
         "triangles": f"{m.triangles} at the finest level",
         "left out": f"{len(m.skipped)} source tiles",
     }
-    table = Table(show_lines=False)
-    for column in ("", str(cache)):
-        table.add_column(column, overflow="fold")  # paths are read from their end
-    for name, value in facts.items():
-        table.add_row(name, value)
-    Console().print(table)
-    table = Table("level", "tiles", "texel m", "geometric error m", "MB")
-    for level in levels(opened):
-        row = (level.gsd_m, level.geometric_error_m, level.megabytes)
-        table.add_row(str(level.level), str(level.tiles), *(f"{x:.2f}" for x in row))
-    Console().print(table)
-    _print_warnings(m.warnings)
+    show_table(("", str(cache)), facts.items())
+    rows = [
+        (str(one.level), str(one.tiles), f"{one.gsd_m:.2f}", f"{one.geometric_error_m:.2f}",
+         f"{one.megabytes:.2f}")
+        for one in levels(opened)
+    ]  # fmt: skip
+    show_table(("level", "tiles", "texel m", "geometric error m", "MB"), rows)
+    tell_warnings(m.warnings)
     for file, written, option in ((geojson, as_geojson, "--geojson"), (kml, as_kml, "--kml")):
         if file is not None:
             write_result(file, written(m, opened.path.name), option)
@@ -287,18 +277,17 @@ def verify(cache: CachePath) -> None:
     opened = TileCache.open(cache)
     with show_work(Console(stderr=True), f"hashing {opened.manifest.tiles} tiles, seeking holes"):
         result = check(opened)
-    console = Console()
-    _print_warnings(opened.manifest.warnings)
+    tell_warnings(opened.manifest.warnings)
     for line in result.damaged:
-        console.print(f"[red]{line}")
+        tell(f"[red]{line}")
     for hole in result.holes[:10]:
         lat, lon = hole.centre
-        console.print(f"hole of {hole.area_m2:.0f} m² at {lat:.6f}, {lon:.6f}")
-    console.print(
+        tell(f"hole of {hole.area_m2:.0f} m² at {lat:.6f}, {lon:.6f}")
+    tell(
         f"{result.tiles - len(result.damaged)} of {result.tiles} tiles intact, "
         f"{len(result.holes)} holes, {result.covered_m2 / 1e6:.3f} km² covered"
     )
-    console.print(f"map_sha256: {map_hash(cache)}", soft_wrap=True)
+    tell(f"map_sha256: {map_hash(cache)}")
     if not result.ok:
         raise typer.Exit(1)
 
@@ -337,7 +326,7 @@ def render(
         write_rgb(out, view.rgb)
         write_rgb(depth, inspect.depth_picture(view.depth))
     shown = view.depth[view.depth > 0]
-    Console().print(f"{out}, {depth}: depth {shown.min():.1f} to {shown.max():.1f} m")
+    tell(f"{out}, {depth}: depth {shown.min():.1f} to {shown.max():.1f} m")
 
 
 @app.command("export")
@@ -356,7 +345,7 @@ def export(
     opened = TileCache.open(cache)
     with writing(out, "--out"), show_work(Console(stderr=True), "joining the tiles"):
         triangles = export_glb(opened, out, level)
-    Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
+    tell(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
 
 
 def _make_overview(cache: Path) -> None:
@@ -374,4 +363,4 @@ def _make_overview(cache: Path) -> None:
     if opened is not None:
         with opened as relocalizer:
             view = relocalizer.overview
-            Console().print(f"overview: {view.area_km2:.2f} km², {view.nbytes / 1e6:.1f} MB")
+            tell(f"overview: {view.area_km2:.2f} km², {view.nbytes / 1e6:.1f} MB")

@@ -8,14 +8,11 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from companion.cli.before.shared_options import Record, RecordMap, RecordTlog
-from companion.cli.console import require_extra, serve
-from companion.errors import ConfigError, RecordError
-from companion.live.config import ConsoleConfig
-from companion.settings_file import SettingsError, validated
+from companion.cli.console import listening, require_extra, serve
+from companion.cli.output import show_table, tell, tell_warnings
+from companion.errors import RecordError
 from companion.terminal.steps import COMPILES, show_count, show_steps, tally
 from localizer.geometry.pose import Array
 
@@ -43,21 +40,20 @@ def replay_command(
     loaded = load_record(record, tlog=tlog, map_cache=map_cache)
     with show_count(Console(stderr=True), "localizing", begins=COMPILES) as show:
         summary = summarize(replay(loaded, tally(show, len(loaded.estimates))))
-    table = Table(title=str(record))
-    for column in ("", "median", "p95", "max"):
-        table.add_column(column, justify="right" if column else "left")
-    table.add_row("position differs, m", *_spread(summary.translation_m, 2))
-    table.add_row("rotation differs, °", *_spread(summary.rotation_deg, 3))
-    console = Console()
     if doubt := loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map)):
-        console.print(f"[yellow]warning:[/] {escape(doubt)}", highlight=False, soft_wrap=True)
-    console.print(table)
-    console.print(
+        tell_warnings((doubt,))
+    columns = ("", "median", "p95", "max")
+    rows = (
+        ("position differs, m", *_spread(summary.translation_m, 2)),
+        ("rotation differs, °", *_spread(summary.rotation_deg, 3)),
+    )
+    show_table(columns, rows, str(record), columns[1:])
+    tell(
         f"{summary.frames} frames: {summary.accepted_recorded} accepted in flight, "
         f"{summary.accepted_replayed} in the replay, {summary.accepted_both} in both"
     )
     agrees = summary.agrees(tolerance_m)
-    console.print("[green]agrees" if agrees else "[red]differs")
+    tell("[green]agrees" if agrees else "[red]differs")
     raise typer.Exit(0 if agrees else 1)
 
 
@@ -82,10 +78,7 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
     map_path = map_cache or tables.map_path
     if map_path is None:
         raise RecordError(f"{record}: does not say which map was flown on; give it as --map")
-    try:
-        config = validated(ConsoleConfig, {"listen": listen})
-    except SettingsError as error:
-        raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
+    config = listening("--console", listen)
     with (
         show_steps(Console(stderr=True)) as say,
         map_pictures(map_path, flown=tables.flown_map) as pictures,

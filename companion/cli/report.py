@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
+from companion.cli.output import tell
 from companion.errors import ReportError
 from companion.terminal.links import file_link
 from companion.terminal.steps import show_steps
@@ -37,4 +39,4 @@ def report_command(
         is_new = not (out or folder / NAME).exists()
         path = write_page(folder, out, say)
     said = "report:" if is_new else "report, in place of the one before:"
-    Console().print(said, file_link(path), soft_wrap=True, highlight=False)
+    tell(Text.assemble(f"{said} ", file_link(path)))

@@ -16,8 +16,8 @@ from companion.console.record_rows import ABSURD, estimate_of, last_row, target_
 from companion.console.source import Newest, sample_of
 from companion.live.protocol import Message
 from companion.offline.record import RecordTables
-from companion.reporting.autopilot import AutopilotTracks, TimedTrack, read_autopilot
 from companion.reporting.pictures import MapPictures
+from companion.reporting.record import AutopilotTracks, TimedTrack, read_autopilot
 
 _STEP_S = 0.5
 _PLOTTED = 600  # seconds before a place of the time bar that plots and tracks begin with

@@ -5,6 +5,7 @@ Common form: NED from camera (3, 3), OpenCV axes, at the camera's position.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,19 +25,8 @@ from localizer.geometry.pose import Array, Pose, euler_from_matrix, matrix_from_
 _LOCKED = 1e-9  # cosine of a pitch at which roll and yaw turn about the same axis
 
 
-@dataclass(frozen=True)
-class Angles:
-    """Euler angles Rz(yaw) Ry(pitch) Rx(roll), degrees, of a body in NED or of a gimbal."""
-
-    roll_deg: float
-    pitch_deg: float
-    yaw_deg: float
-
-    @property
-    def radians(self) -> tuple[float, float, float]:
-        """(roll, pitch, yaw), rad."""
-        roll, pitch, yaw = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
-        return float(roll), float(pitch), float(yaw)
+Degrees = tuple[float, float, float]
+"""Euler angles (roll, pitch, yaw), Rz(yaw) Ry(pitch) Rx(roll), of a body in NED or of a gimbal."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +38,17 @@ class AutopilotAngles:
     name: str
     time_ns: int | None
     position: Geodetic
-    body: Angles
-    gimbal: Angles
+    body_deg: Degrees
+    gimbal_deg: Degrees
     gimbal_frame: GimbalFrame = GimbalFrame.HEADING
 
 
 def pose_of_autopilot(angles: AutopilotAngles, frame: LocalFrame) -> Pose:
     """The camera's pose in the map. The position is taken as the camera's: no lever arm."""
     p = angles.position
-    body = matrix_from_euler(*angles.body.radians)
-    gimbal = GimbalAngles(*angles.gimbal.radians, angles.gimbal_frame)
+    body = matrix_from_euler(*np.radians(angles.body_deg))
+    roll, pitch, yaw = map(math.radians, angles.gimbal_deg)
+    gimbal = GimbalAngles(roll, pitch, yaw, angles.gimbal_frame)
     return world_from_camera(
         frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m),
         body,
@@ -76,24 +67,21 @@ def autopilot_of_pose(
     A camera's pose alone does not determine the vehicle's attitude.
     """
     position = frame.position(pose.translation)
-    gimbal = gimbal_of_pose(pose, frame)
-    body = Angles(0.0, 0.0, gimbal.yaw_deg)
-    relative = Angles(gimbal.roll_deg, gimbal.pitch_deg, 0.0)
-    return AutopilotAngles(name, time_ns, position, body, relative)
+    roll, pitch, yaw = gimbal_of_pose(pose, frame)
+    return AutopilotAngles(name, time_ns, position, (0.0, 0.0, yaw), (roll, pitch, 0.0))
 
 
-def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Angles:
+def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Degrees:
     """Gimbal angles of a pose relative to north and the horizon, as in DJI's XMP."""
     to_ned = ned_from_world(frame, frame.position(pose.translation))
     return angles_of_matrix(to_ned @ pose.rotation @ GIMBAL_FROM_CAMERA.T)
 
 
-def angles_of_matrix(R: Array) -> Angles:
+def angles_of_matrix(R: Array) -> Degrees:
     """Euler angles of a rotation (3, 3). At pitch -90 or 90 roll and yaw merge: roll is 0."""
     if np.hypot(R[0, 0], R[1, 0]) < _LOCKED:
         pitch = float(np.copysign(np.pi / 2, -R[2, 0]))
         roll, yaw = 0.0, float(np.arctan2(-R[0, 1], R[1, 1]))
     else:
         roll, pitch, yaw = euler_from_matrix(R)
-    degrees = np.degrees([roll, pitch, yaw])
-    return Angles(float(degrees[0]), float(degrees[1]), float(degrees[2]))
+    return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from companion.convert.angles import (
-    Angles,
     AutopilotAngles,
     autopilot_of_pose,
     pose_of_autopilot,
@@ -82,14 +81,6 @@ def _write_poses(path: Path, poses: Sequence[StampedPose], place: MapReference) 
         if not pose.name or pose.name.split() != [pose.name]:
             raise PoseFileError(f"{path}: a pose line cannot hold the name {pose.name!r}")
     write_poses(path, (pose_row(p.name, p.world_from_camera, place.frame) for p in poses))
-
-
-def _read_tum(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    return read_tum(path)
-
-
-def _write_tum(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
-    write_tum(path, poses)
 
 
 def _read_colmap(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
@@ -171,12 +162,13 @@ def _autopilot_row(row: dict[str, Any], where: str) -> AutopilotAngles:
         lat, lon, height, *angles = (float(row[name]) for name in AUTOPILOT_COLUMNS[2:11])
         if not np.isfinite(angles).all():
             raise ValueError("angles must be finite")
+        roll, pitch, yaw, *gimbal = angles
         return AutopilotAngles(
             row["name"],
             int(row["time_ns"]) if row["time_ns"] else None,
             Geodetic(lat, lon, height),
-            Angles(*angles[:3]),
-            Angles(*angles[3:]),
+            (roll, pitch, yaw),
+            (gimbal[0], gimbal[1], gimbal[2]),
             GimbalFrame(row["gimbal_frame"]),
         )
     except (KeyError, TypeError, ValueError, GeoreferenceError) as error:
@@ -192,17 +184,12 @@ def _write_autopilot(path: Path, poses: Sequence[StampedPose], place: MapReferen
         writer.writerow(AUTOPILOT_COLUMNS)
         for pose in poses:
             a = autopilot_of_pose(pose.name, pose.time_ns, pose.world_from_camera, place.frame)
-            p, angles = a.position, (a.body, a.gimbal)
+            p, angles = a.position, (*a.body_deg, *a.gimbal_deg)
             writer.writerow([
                 a.name, "" if a.time_ns is None else a.time_ns,
                 f"{p.latitude_deg:.9f}", f"{p.longitude_deg:.9f}", f"{p.height_m:.4f}",
-                *(f"{x:.7f}" for x in _flat(angles)), a.gimbal_frame.value,
+                *(f"{x:.7f}" for x in angles), a.gimbal_frame.value,
             ])  # fmt: skip
-
-
-def _flat(angles: Iterable[Angles]) -> Iterable[float]:
-    for a in angles:
-        yield from (a.roll_deg, a.pitch_deg, a.yaw_deg)
 
 
 def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
@@ -220,26 +207,18 @@ def _read_record(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
     return poses
 
 
-def _read_photos(path: Path, place: MapReference) -> tuple[StampedPose, ...]:
-    return read_photos(path, place.frame, place.heights, place.tell)
-
-
-def _write_photos(path: Path, poses: Sequence[StampedPose], place: MapReference) -> None:
-    write_sidecars(path, poses, place.frame, place.heights)
-
-
 READERS: dict[str, Reader] = {
     "poses": _read_poses,
-    "tum": _read_tum,
+    "tum": lambda path, _: read_tum(path),
     "colmap": _read_colmap,
-    "photos": _read_photos,
+    "photos": lambda path, place: read_photos(path, place.frame, place.heights, place.tell),
     "autopilot": _read_autopilot,
     "record": _read_record,
 }
 WRITERS: dict[str, Writer] = {
     "poses": _write_poses,
-    "tum": _write_tum,
+    "tum": lambda path, poses, _: write_tum(path, poses),
     "colmap": _write_colmap,
-    "photos": _write_photos,
+    "photos": lambda path, poses, place: write_sidecars(path, poses, place.frame, place.heights),
     "autopilot": _write_autopilot,
 }

@@ -146,14 +146,14 @@ def write_sidecars(
     folder.mkdir(parents=True, exist_ok=True)
     for pose in poses:
         position = frame.position(pose.world_from_camera.translation)
-        gimbal = gimbal_of_pose(pose.world_from_camera, frame)
+        roll, pitch, yaw = gimbal_of_pose(pose.world_from_camera, frame)
         tags = {
             "GpsLatitude": f"{position.latitude_deg:.9f}",
             "GpsLongitude": f"{position.longitude_deg:.9f}",
             "AbsoluteAltitude": f"{position.height_m - lift:+.4f}",
-            "GimbalRollDegree": f"{gimbal.roll_deg:+.7f}",
-            "GimbalPitchDegree": f"{gimbal.pitch_deg:+.7f}",
-            "GimbalYawDegree": f"{gimbal.yaw_deg:+.7f}",
+            "GimbalRollDegree": f"{roll:+.7f}",
+            "GimbalPitchDegree": f"{pitch:+.7f}",
+            "GimbalYawDegree": f"{yaw:+.7f}",
         }
         attributes = "\n".join(f'   drone-dji:{name}="{value}"' for name, value in tags.items())
         file = folder / Path(pose.name).with_suffix(".xmp").name

@@ -49,10 +49,9 @@ from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, o
 from companion.sources.timing import system_minus_monotonic
 from companion.sources.zoom import ZoomedFrames
 from companion.targets.clicks import ClickPolicy
-from companion.targets.detections import DetectionListener
+from companion.targets.detections import DetectionListener, TargetNumbers
 from companion.targets.detector.worker import BoxDetector
 from companion.targets.frame_times import FrameTimes
-from companion.targets.numbers import TargetNumbers
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import matrix_from_quaternion

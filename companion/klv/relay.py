@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TypeVar
 
 import av
 
@@ -27,6 +28,8 @@ from localizer.geometry.pose import Array
 from localizer.types import PoseEstimate, TargetFix
 
 _log = logging.getLogger(__name__)
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 _QUEUE = 512  # packets: seconds of video
 _KEPT = 64  # exposures, estimates, targets
 _TARGET_NS = 1_000_000_000  # a target that was seen so near to a picture is the picture's
@@ -100,9 +103,7 @@ class KlvRelay:
     def frame_exposed(self, pts: Fraction, exposure_time_ns: int) -> None:
         """Store the exposure time of the frame with that presentation time (s). Never blocks."""
         with self._condition:
-            self._exposures[pts] = exposure_time_ns
-            while len(self._exposures) > _KEPT:
-                self._exposures.pop(next(iter(self._exposures)))
+            _keep(self._exposures, pts, exposure_time_ns)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Take every estimate. An accepted one's pose is stored; a rejected or later one ends the
@@ -111,17 +112,13 @@ class KlvRelay:
         with self._condition:
             self._newest_ns = max(self._newest_ns, estimate.exposure_time_ns)
             if estimate.accepted:
-                self._estimates[estimate.exposure_time_ns] = estimate
-                while len(self._estimates) > _KEPT:
-                    self._estimates.pop(next(iter(self._estimates)))
+                _keep(self._estimates, estimate.exposure_time_ns, estimate)
             self._condition.notify()
 
     def add_target(self, target: TargetEstimate) -> None:
         """Store a target's fix, for the metadata of frames within 1 s of it. Never blocks."""
         with self._condition:
-            self._targets[target.fix.exposure_time_ns] = target
-            while len(self._targets) > _KEPT:
-                self._targets.pop(next(iter(self._targets)))
+            _keep(self._targets, target.fix.exposure_time_ns, target)
 
     def _put(self, item: _RelayItem) -> None:
         with self._condition:
@@ -206,3 +203,10 @@ class KlvRelay:
         self.failed += 1
         if self.failed == 1:
             _log.warning("klv.output %s: %s", self._config.output, error)
+
+
+def _keep(of: dict[_Key, _Value], key: _Key, value: _Value) -> None:
+    """Store a value, and drop the oldest of more than 64."""
+    of[key] = value
+    if len(of) > _KEPT:
+        del of[next(iter(of))]

@@ -252,7 +252,7 @@ class ConsoleData:
             "sigma_up_m": float(np.sqrt(max(fix.covariance[2, 2], 0.0))),
             "elsewhere": fix.elsewhere,
             "pixel": None if fix.pixel is None else [float(x) for x in fix.pixel],
-            "velocity_m_s": None if target.velocity is None else [*map(float, target.velocity)],
+            "velocity_m_s": None if fix.velocity is None else [*map(float, fix.velocity)],
         }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.recorded.flight import LogBeside
+from companion.sources.zoom import ZoomTable
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.tlog import read_tlog
@@ -44,6 +45,15 @@ class RecordedAutopilot(VehicleTracker):
                 elif message.tc1 != 0:  # an answer; ts1 is our own time of the question
                     self.timesync(message.tc1, message.ts1, received_ns)
             self._next = next(self._messages, None)
+
+    def zoom_factor(self, zoom: ZoomTable | None, time_ns: int) -> float | None:
+        """Multiple of the model's focal length by the log; 1 if the camera has no zoom, None if the
+        log has no value.
+        """
+        if zoom is None:
+            return 1.0
+        level = self.zoom_at(time_ns, zoom.hold_s)
+        return None if level is None else zoom.factor(level)
 
     def state(self) -> VehicleState:
         """The vehicle's state at the current replay time."""

@@ -1,4 +1,6 @@
-"""Reads a flight's record: tables, and localized frames as a `RecordedFlight`."""
+"""Reads a flight's record: tables, and localized frames as a `RecordedFlight`; and checks whether a
+map is the one of a record, because it may have been built again since.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ from pydantic import ValidationError
 from companion.config import CameraModel, CompanionConfig, parse_config
 from companion.errors import ConfigError, RecordError
 from companion.flight.recorder import MANIFEST_NAME
-from companion.offline.flown_map import FlownMap
 from companion.offline.tables import Columns, poses, read_columns
+from companion.preflight.map_pin import map_hash
 from companion.recorded.cameras import camera_given
 from companion.recorded.flight import (
     LogBeside,
@@ -27,7 +29,8 @@ from companion.trajectory import snapshot_name
 from localizer.errors import CameraError, GeoreferenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic
-from localizer.geometry.pose import Pose
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.cache import TileCache
 from localizer.plain_files import plain_text
 
 STAGES = ("reference", "extract", "register", "latency")
@@ -325,3 +328,46 @@ def mapping(value: Any) -> dict[str, Any]:
 def is_time_ns(text: str) -> bool:
     """Whether a snapshot's file name is an exposure time."""
     return text.isascii() and text.isdigit() and len(text) <= _DIGITS
+
+
+_SAME_FRAME_M = 1.0
+
+
+@dataclass(frozen=True)
+class FlownMap:
+    """A record's data about its map. sha256: hash of the map's manifest, None in old records.
+    place, point: one pose in WGS84 and in the map's ENU, m; None if not recorded.
+    """
+
+    folder: Path
+    sha256: str | None = None
+    place: Geodetic | None = None
+    point: Array | None = None
+
+    def require_frame(self, cache: TileCache) -> None:
+        """`RecordError` if the map's origin is not the flight's, because all recorded positions
+        would be shifted.
+        """
+        if self.place is None or self.point is None:
+            return
+        p = self.place
+        here = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
+        away_m = float(np.linalg.norm(here - self.point))
+        if away_m > _SAME_FRAME_M:
+            raise RecordError(
+                f"{self.folder}: flown over a map about another origin than {cache.path}, "
+                f"{away_m:.0f} m away: was it built again since? give the flight's own as --map"
+            )
+
+    def mismatch(self, cache: TileCache) -> str:
+        """A warning if the map's hash is not the flown one's; "" if it is, or none was recorded."""
+        try:
+            same = self.sha256 in (None, map_hash(cache.path))
+        except ConfigError as error:
+            return str(error)
+        if same:
+            return ""
+        return (
+            f"{cache.path} is not the map that was flown over: was it built again since? what "
+            "differs from the flight may be the map's"
+        )

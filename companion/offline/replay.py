@@ -18,7 +18,7 @@ from companion.flight.priors import AutopilotPose
 from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import MIN_IMAGES, FlightRecord, RecordedEstimate
 from companion.recorded.flight import RecordedFrame
-from companion.sources.zoom import ZoomTable, with_focal_factor
+from companion.sources.zoom import with_focal_factor
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
@@ -89,7 +89,9 @@ def replay(
                 prior = pose.prior(recorded.exposure_time_ns)
                 if prior is not None:
                     localizer.offer(prior)
-            factor = _logged_zoom_factor(config.camera.zoom, autopilot, recorded)
+            factor: float | None = 1.0
+            if recorded.focal_px is None:  # as in older records
+                factor = autopilot.zoom_factor(config.camera.zoom, recorded.exposure_time_ns)
             if factor is None:  # a fix of it would be metres off and look as good as any
                 unzoomed += 1
                 frames.append(ReplayedFrame(recorded, None))
@@ -116,18 +118,6 @@ def replay(
         return frames
     finally:
         stack.close()
-
-
-def _logged_zoom_factor(
-    zoom: ZoomTable | None, autopilot: RecordedAutopilot, recorded: RecordedEstimate
-) -> float | None:
-    """Multiple of the model's focal length by the log, for a frame whose row has none, as in older
-    records; 1 if the camera has no zoom, None if the log has no value.
-    """
-    if zoom is None or recorded.focal_px is not None:
-        return 1.0
-    level = autopilot.zoom_at(recorded.exposure_time_ns, zoom.hold_s)
-    return None if level is None else zoom.factor(level)
 
 
 def _localize(

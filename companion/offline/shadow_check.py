@@ -66,27 +66,29 @@ class ReportedText:
     alert: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass
 class ShadowCheck:
-    """Result of the check. frames, localized, accepted: numbers of images; judged: fixes that the
-    monitor checked, passed: those that it did not hold; seconds: duration of the images; go_s,
-    first_go_s: how long the shadow check was ready, and from when (s from the first image), None:
-    never; score: the last one with enough fixes; held_s: hold time by alert; lines: texts to the
-    operator; notes: assumptions.
+    """Result of the check, counted while the flight plays. frames, localized, accepted: numbers of
+    images; judged: fixes that the monitor checked, passed: those that it did not hold; seconds:
+    duration of the images; go_s, first_go_s: how long the shadow check was ready, and from when (s
+    from the first image), None: never; score: the last one with enough fixes; held_s: hold time by
+    alert; lines: texts to the operator; notes: assumptions.
     """
 
-    frames: int
-    localized: int
-    accepted: int
-    judged: int
-    passed: int
-    seconds: float
-    go_s: float
-    first_go_s: float | None
-    score: ShadowScore
-    held_s: dict[str, float]
-    lines: tuple[ReportedText, ...]
-    notes: tuple[str, ...]
+    frames: int = 0
+    localized: int = 0
+    accepted: int = 0
+    judged: int = 0
+    passed: int = 0
+    seconds: float = 0.0
+    go_s: float = 0.0
+    first_go_s: float | None = None
+    score: ShadowScore = field(
+        default_factory=lambda: ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),))
+    )
+    held_s: dict[str, float] = field(default_factory=dict)
+    lines: list[ReportedText] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
 
     @property
     def go(self) -> bool:
@@ -123,7 +125,7 @@ def shadow_check(
         for message in messages.before:
             player.bridge.play(message)
         dated: Iterator[tuple[int, Any]] = heapq.merge(
-            ((t + to_record, m) for t, m in messages.dated()),
+            ((t + to_record, m) for t, m in messages.dated),
             ((f.exposure_time_ns + flight.log.ahead_ns + to_record + delay_ns, f) for f in frames),
             key=lambda one: one[0],
         )
@@ -139,35 +141,31 @@ def shadow_check(
 
 
 class _Messages:
-    """The log's messages during the images. before: messages that must be known at the begin;
-    origin: the EKF's, GPS_GLOBAL_ORIGIN.
+    """The log's messages during the images. dated: in the order of their times; before: messages
+    that must be known at the begin; origin: the EKF's, GPS_GLOBAL_ORIGIN.
     """
 
     def __init__(self, path: Path, begin_ns: int, end_ns: int) -> None:
         self.notes: tuple[str, ...] = ()
-        self._within: list[Dated] = []
+        self.dated: list[Dated] = []
         before: dict[tuple[int, str], Any] = {}
         for time_ns, message in vehicle_messages(path):
             if time_ns < begin_ns:
                 before[message.get_srcSystem(), message.get_type()] = message
             elif time_ns <= end_ns:
-                self._within.append((time_ns, message))
-        self._within.sort(key=lambda one: one[0])
-        if not self._within:
+                self.dated.append((time_ns, message))
+        self.dated.sort(key=lambda one: one[0])
+        if not self.dated:
             raise RecordError(f"{path}: holds nothing of the time of the images")
         self.before = tuple(m for (_, kind), m in before.items() if kind in _TOLD_BEFORE)
-        every = (*before.values(), *(m for _, m in self._within))
+        every = (*before.values(), *(m for _, m in self.dated))
         told = [m for m in every if m.get_type() == "GPS_GLOBAL_ORIGIN"]
         self.origin = told[-1] if told else self._origin(path)
-
-    def dated(self) -> list[Dated]:
-        """The messages in the order of their times."""
-        return self._within
 
     def _origin(self, path: Path) -> Any:
         """The EKF's origin, by local and global position at one time; else its first position."""
         local, place = None, None
-        for _, message in self._within:
+        for _, message in self.dated:
             if message.get_type() == "LOCAL_POSITION_NED":
                 local = message
             elif message.get_type() == "GLOBAL_POSITION_INT" and message.lat:
@@ -213,20 +211,6 @@ def _photos(flight: RecordedFlight, camera: Camera) -> Iterator[Frame]:
                 yield one.load(camera, one.time_ns, sequence)
 
 
-@dataclass
-class _Counts:
-    frames: int = 0
-    localized: int = 0
-    accepted: int = 0
-    judged: int = 0
-    passed: int = 0
-    go_s: float = 0.0
-    first_go_s: float | None = None
-    problem: str = ""
-    held: Counter[str] = field(default_factory=Counter)
-    lines: list[ReportedText] = field(default_factory=list)
-
-
 class _Player:
     """The components of one flight under the record's clock. origin: GPS_GLOBAL_ORIGIN, with which
     the vehicle answers requests.
@@ -237,10 +221,7 @@ class _Player:
         self._parts = Assembly(
             _shadow(config), [p for p in COMPONENTS if p.kind in _KINDS], lambda: self.now_ns
         )
-        self._counts, self._scores = (
-            _Counts(),
-            [ShadowScore(False, 0, (alert(AlertId.SHADOW_NOT_COMPARED),))],
-        )
+        self._counts, self._held, self._problem = ShadowCheck(), Counter[str](), ""
         self._parts.channels.alerts.subscribe(self._told)
         self._parts.make(up)
         self.bridge, self._monitor = self._parts[Bridge], self._parts.get(IntegrityMonitor)
@@ -264,7 +245,7 @@ class _Player:
             if self._monitor is not None and next_ns % _TURN_NS == 0:
                 self._monitor.run_checks()
                 if (reason := self._monitor.reason) is not None:
-                    self._counts.held[reason.id.value] += 1
+                    self._held[reason.id.value] += 1
             if next_ns % _SCORE_NS == 0 and self._begun_ns is not None:
                 self._score()
         self.now_ns = max(self.now_ns, time_ns)
@@ -278,7 +259,7 @@ class _Player:
         try:
             estimate = self._estimate(frame)
         except (OutsideMapError, MapLoadingError) as error:
-            self._counts.problem = str(error)
+            self._problem = str(error)
             return
         if estimate is None or self._reference is None:
             return
@@ -290,16 +271,11 @@ class _Player:
 
     def result(self, notes: tuple[str, ...]) -> ShadowCheck:
         """The result of all images."""
-        c = self._counts
+        if not self._counts.localized:
+            notes = (*notes, f"no image was localized: {self._problem or 'no place is known'}")
         seconds = (self._last_ns - (self._begun_ns or self._last_ns)) * 1e-9
-        if not c.localized:
-            notes = (*notes, f"no image was localized: {c.problem or 'no place is known'}")
-        enough = [s for s in self._scores if s.samples >= MINIMUM_SAMPLES]
-        held_s = {of: count * _TURN_NS * 1e-9 for of, count in c.held.most_common()}
-        return ShadowCheck(
-            c.frames, c.localized, c.accepted, c.judged, c.passed, seconds, c.go_s, c.first_go_s,
-            (enough or self._scores)[-1], held_s, tuple(c.lines), notes,
-        )  # fmt: skip
+        held_s = {of: count * _TURN_NS * 1e-9 for of, count in self._held.most_common()}
+        return replace(self._counts, seconds=seconds, held_s=held_s, notes=notes)
 
     def _estimate(self, frame: Frame) -> PoseEstimate | None:
         """Localize as `DualThreadEngine`, its threads' work in turn; None without a prior."""
@@ -326,7 +302,8 @@ class _Player:
 
     def _score(self) -> None:
         score = self.bridge.shadow_score()
-        self._scores.append(score)
+        if score.samples >= MINIMUM_SAMPLES or self._counts.score.samples < MINIMUM_SAMPLES:
+            self._counts.score = score
         if score.ready:
             self._counts.go_s += _SCORE_NS * 1e-9
             if self._counts.first_go_s is None:

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from html import escape
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from companion.planning.plan import MissionForecast
 from companion.planning.verdicts import LegVerdict, VisionGap
-from companion.reporting.layout import data_uri
-from companion.writing import write_result
+from companion.reporting.content import Report, ReportTable
+from companion.reporting.layout import write_report
+from companion.versions import made_by
 from localizer.types import Image
 
-_CSS = """
-body{font:15px/1.45 system-ui,sans-serif;max-width:1080px;margin:2em auto;
-padding:0 1em;color:#1c2430}
-h1{font-size:1.5em;margin-bottom:.2em}table{border-collapse:collapse;margin:.6em 0}
-td,th{border:1px solid #c9d0d8;padding:.25em .6em;text-align:left}th{background:#eef1f4}
-tr.bad td{background:#fbe4e4}.verdict{font-size:1.15em;padding:.5em .8em;border-left:6px solid}
-.ok{border-color:#2a9d4a;background:#e8f5ec}.no{border-color:#c62828;background:#fbe4e4}
-img{width:100%;max-width:1000px;border:1px solid #c9d0d8}small{color:#5b6470}
-"""
 LEG_HEADINGS = (
     "leg", "m", "works", "sigma m", "lost or wrong", "map", "similar", "condition", "reason"
 )  # fmt: skip
@@ -146,42 +137,20 @@ def as_data(plan: MissionForecast) -> dict[str, Any]:
 def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
     """Write the page; `ReportError` if it cannot be written."""
     q = plan.question
-    shown = "".join(
-        f'<h2>{escape(title)}</h2><img alt="{escape(title)}" src="{data_uri(rgb)}">'
-        for title, rgb in pictures
+    bad = frozenset(k for k, v in enumerate(plan.verdicts) if not v.holds)
+    tables = (
+        ("Legs", ReportTable(LEG_HEADINGS, tuple(map(leg_row, plan.verdicts)), bad)),
+        ("Without vision", ReportTable(STRETCH_HEADINGS, tuple(map(stretch_row, plan.stretches)))),
+        ("Alternatives", ReportTable(PROPOSAL_HEADINGS, tuple(proposal_rows(plan)))),
     )
-    bad = {k for k, v in enumerate(plan.verdicts) if not v.holds}
-    body = (
-        f"<h1>Forecast of {escape(q.mission_file.name)}</h1>"
-        f"<p class='verdict {'ok' if plan.holds else 'no'}'>{escape(verdict_words(plan))}</p>"
-        f"<p>Under {escape(', '.join(q.conditions))}; sigma to {q.limits.sigma_m:g} m, at most "
-        f"{100 * q.limits.risk:.0f} % of the frames lost or more than 1 m wrong.</p>"
-        + "<h2>Legs</h2>"
-        + _table(LEG_HEADINGS, map(leg_row, plan.verdicts), bad)
-        + _part("Without vision", STRETCH_HEADINGS, map(stretch_row, plan.stretches))
-        + _part("Alternatives", PROPOSAL_HEADINGS, proposal_rows(plan))
-        + shown
-        + "<ul>"
-        + "".join(f"<li><small>{escape(note)}</small>" for note in plan.notes)
-        + "</ul>"
+    report = Report(
+        f"Forecast of {q.mission_file.name}",
+        f"Under {', '.join(q.conditions)}; sigma to {q.limits.sigma_m:g} m, at most "
+        f"{100 * q.limits.risk:.0f} % of the frames lost or more than 1 m wrong.",
+        verdict=verdict_words(plan),
+        tables=tuple(table for table in tables if table[1].rows),
+        pictures=tuple(pictures),
+        versions=made_by(),
+        notes=plan.notes,
     )
-    text = (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Forecast</title>'
-        f"<style>{_CSS}</style><body>{body}</body></html>"
-    )
-    # A file's name may hold half a character (a lone surrogate).
-    write_result(path, text.encode("utf-8", "replace").decode("utf-8"))
-
-
-def _part(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    made = list(rows)
-    return f"<h2>{escape(title)}</h2>{_table(headings, made, set())}" if made else ""
-
-
-def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], bad: set[int]) -> str:
-    head = "".join(f"<th>{escape(h)}" for h in headings)
-    body = "".join(
-        f"<tr{' class=bad' if k in bad else ''}>" + "".join(f"<td>{escape(c)}" for c in row)
-        for k, row in enumerate(rows)
-    )
-    return f"<table><tr>{head}{body}</table>"
+    write_report(report, path)

@@ -8,7 +8,6 @@ import queue
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 
 from companion.config import CompanionConfig
 from companion.planning.verdicts import MissionLimits, SampleVerdict, sample_verdict
@@ -95,12 +94,3 @@ def surveyor(
             optimizer = JNGO(config.registration, threads=1)
             forecasters.append(Forecaster(renderer, extractor, optimizer, camera, config))
         yield Surveyor(cache, aim, conditions, limits, forecasters)
-
-
-def shifted_sample(
-    sample: PathSample, rise_m: float, pitch_deg: float, turn_deg: float
-) -> PathSample:
-    """The sample raised by rise_m, with another camera pitch and turn from the path."""
-    position = sample.position.copy()
-    position[2] += rise_m
-    return replace(sample, position=position, pitch_deg=pitch_deg, turn_deg=turn_deg)

@@ -1,4 +1,6 @@
-"""Computes the camera's poses along a mission, in the map's frame."""
+"""Computes the camera's poses along a mission, in the map's frame. A leg is a straight line, a
+spline as ArduPilot flies it, or a circle.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,14 @@ from companion.geometry import (
     ned_from_world,
     world_from_camera,
 )
-from companion.planning.course import Course, circled, spline, straight
 from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
 from localizer.geometry.antimeridian import geo_box
+from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from mavlink_bridge.mission.gimbal import GimbalTarget, RegionOfInterest
+from mavlink_bridge.mission.items import LoiterCircle
 
 LEAST_LEG_M = 1.0  # shorter ones are climbs on the spot
 # A ray that falls just between two tiles may miss both: some beside it do not.
@@ -160,7 +163,27 @@ class _Site:
 
     def position(self, place: MissionPlace | RegionOfInterest) -> Array:
         """World position (3,)."""
-        return _position(place, self.cache, self.ground, self.launch)
+        cache = self.cache
+        if place.above is HeightAbove.SEA:
+            height = place.height_m + cache.manifest.geoid_separation_m
+        else:
+            east, north = _enu(place.latitude_deg, place.longitude_deg, cache)
+            is_home = place.above is HeightAbove.HOME
+            below = self.launch if is_home else (east, north)
+            surface = self.ground.height_m(*below)
+            if surface is None:
+                what = "home" if is_home else "a waypoint above terrain"
+                at = cache.frame.position([*below, 0.0])
+                raise MissionFileError(
+                    f"{what} at {at.latitude_deg:.6f}, {at.longitude_deg:.6f} is not over the map "
+                    f"{cache.path} ({_extent(cache, below)}), so nobody knows how high its ground "
+                    "is: plan it over the map, or with altitudes above mean sea level"
+                )
+            # Above the ellipsoid, not above the map's plane: that falls away by 8 m in 10 km.
+            height = cache.frame.position([*below, surface]).height_m + place.height_m
+        return np.asarray(
+            cache.frame.enu_from_geodetic(place.latitude_deg, place.longitude_deg, height)
+        )
 
 
 class _Legs:
@@ -252,36 +275,6 @@ def _enu(latitude_deg: float, longitude_deg: float, cache: TileCache) -> tuple[f
     return float(east), float(north)
 
 
-def _position(
-    waypoint: MissionPlace | RegionOfInterest,
-    cache: TileCache,
-    ground: MapHeights,
-    home: tuple[float, float],
-) -> Array:
-    """World position (3,) of a place."""
-    if waypoint.above is HeightAbove.SEA:
-        height = waypoint.height_m + cache.manifest.geoid_separation_m
-        return np.asarray(
-            cache.frame.enu_from_geodetic(waypoint.latitude_deg, waypoint.longitude_deg, height)
-        )
-    east, north = _enu(waypoint.latitude_deg, waypoint.longitude_deg, cache)
-    below = home if waypoint.above is HeightAbove.HOME else (east, north)
-    surface = ground.height_m(*below)
-    if surface is None:
-        what = "home" if waypoint.above is HeightAbove.HOME else "a waypoint above terrain"
-        place = cache.frame.position([*below, 0.0])
-        raise MissionFileError(
-            f"{what} at {place.latitude_deg:.6f}, {place.longitude_deg:.6f} is not over the map "
-            f"{cache.path} ({_extent(cache, below)}), so nobody knows how high its ground is: plan "
-            "it over the map, or with altitudes above mean sea level"
-        )
-    # Above the ellipsoid, not above the map's plane: that falls away by 8 m in 10 km.
-    height = cache.frame.position([*below, surface]).height_m + waypoint.height_m
-    return np.asarray(
-        cache.frame.enu_from_geodetic(waypoint.latitude_deg, waypoint.longitude_deg, height)
-    )
-
-
 def _extent(cache: TileCache, below: tuple[float, float]) -> str:
     """Text on where the map lies, and how far a place (east, north in m) is from it."""
     corners = np.array(
@@ -295,3 +288,83 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
 def length_m(legs: Sequence[FlightLeg]) -> float:
     """Total length of the legs, m."""
     return sum(leg.length_m for leg in legs)
+
+
+_PIECES = 64  # of a spline or a circle
+# The vectors at both ends are shortened to so many times the distance between them
+# (SplineCurve::set_origin_and_destination).
+_LONGEST = 4.0
+
+
+@dataclass(frozen=True)
+class Course:
+    """Path of a leg. points: (N, 3), world metres; leaves: (3,) direction and strength at its end,
+    zero for a stop; nose_deg: heading of the vehicle, clockwise from the path.
+    """
+
+    points: Array
+    leaves: Array
+    nose_deg: float = 0.0
+    is_circle: bool = False
+
+    @property
+    def length_m(self) -> float:
+        """Horizontal length, m."""
+        return float(self._steps().sum())
+
+    def at(self, share: float) -> tuple[Array, float]:
+        """Position (3,), world metres, and direction of the path, degrees clockwise from the map's
+        north, after a share (0 to 1) of the length.
+        """
+        steps = self._steps()
+        done = np.concatenate([[0.0], np.cumsum(steps)])
+        way = share * done[-1]
+        k = int(np.clip(np.searchsorted(done, way, side="right") - 1, 0, len(steps) - 1))
+        start, end = self.points[k], self.points[k + 1]
+        east, north, _ = end - start
+        part = (way - done[k]) / max(steps[k], 1e-9)
+        # As high above the Earth as between the ends: a chord lies below.
+        bulge = 0.5 * part * (1.0 - part) * (east * east + north * north) / EARTH_RADIUS_M
+        position = start + part * (end - start) + (0.0, 0.0, bulge)
+        return position, float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+    def _steps(self) -> Array:
+        return np.asarray(np.hypot(*np.diff(self.points, axis=0)[:, :2].T))
+
+
+def straight(start: Array, end: Array) -> Course:
+    """A straight course between two positions (3,), world metres."""
+    return Course(np.stack([start, end]), end - start)
+
+
+def spline(
+    start: Array, end: Array, arrives: Array, after: Array | None, *, curved_on: bool
+) -> Course:
+    """A spline leg between two positions (3,), world metres. arrives: `leaves` (3,) of the course
+    before; after: next position, None for a stop; curved_on: whether the next leg is a spline.
+    """
+    leaves = np.zeros(3)
+    if after is not None:
+        leaves = after - start if curved_on else after - end
+    longest = _LONGEST * float(np.linalg.norm(end - start))
+    strength = float(np.linalg.norm(arrives) + np.linalg.norm(leaves))
+    scale = min(longest / strength, 1.0) if strength > 0 else 1.0
+    t = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]
+    points = (
+        (2 * t**3 - 3 * t**2 + 1) * start
+        + (t**3 - 2 * t**2 + t) * scale * arrives
+        + (3 * t**2 - 2 * t**3) * end
+        + (t**3 - t**2) * scale * leaves
+    )
+    return Course(points, leaves)
+
+
+def circled(centre: Array, arrives: Array, circle: LoiterCircle) -> Course:
+    """One circle about a position (3,), world metres, from the point where a vehicle flying in
+    direction `arrives` (3,) meets it; counter-clockwise if the circle's radius is negative.
+    """
+    begin = np.arctan2(-arrives[1], -arrives[0])
+    turned = begin - np.sign(circle.radius_m) * np.linspace(0.0, 2.0 * np.pi, _PIECES + 1)
+    out = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
+    nose_deg = float(np.sign(circle.radius_m)) * 90.0 if circle.inward else 0.0
+    return Course(centre + abs(circle.radius_m) * out, np.zeros(3), nose_deg, is_circle=True)

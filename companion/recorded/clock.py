@@ -226,7 +226,7 @@ def _camera(sample: Telemetry | None, frame: LocalFrame) -> tuple[Array, Array, 
     """Attitude (3, 3) to NED, position (3,) in NED and height above the take-off, m; or None."""
     if sample is None or sample.position is None or sample.view is None:
         return None
-    height = next((h.value_m for h in sample.position.heights if h.datum is Datum.TAKEOFF), None)
+    height = sample.position.height_m(Datum.TAKEOFF)
     if height is None or height < _LEAST_HEIGHT_M:
         return None
     enu = frame.enu_from_geodetic(sample.position.latitude_deg, sample.position.longitude_deg, 0.0)

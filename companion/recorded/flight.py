@@ -6,6 +6,7 @@ pitch -90 looks down, yaw clockwise from true north. `None` means not recorded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -23,6 +24,9 @@ from localizer.geometry.pose import Array, matrix_from_euler, so3_exp, so3_log
 from localizer.types import Frame
 
 Kind = Literal["photos", "video", "sequence"]
+TILT_DEG, HEADING_DEG = 2.0, 6.0  # sigmas of a gimbal that is not calibrated, and of its compass
+ABSOLUTE_M = 30.0  # of a drone's altitude without RTK: barometer and model of the atmosphere
+_BAROMETER_M, _BAROMETER_SHARE = 2.0, 0.02
 
 
 class Datum(Enum):
@@ -41,6 +45,12 @@ class Height:
     datum: Datum
     sigma_m: float
 
+    @classmethod
+    def by_barometer(cls, value_m: float) -> Height:
+        """A height above the take-off point by a drone's barometer."""
+        sigma = math.hypot(_BAROMETER_M, _BAROMETER_SHARE * value_m)
+        return cls(value_m, Datum.TAKEOFF, sigma)
+
 
 @dataclass(frozen=True)
 class RecordedPosition:
@@ -52,6 +62,10 @@ class RecordedPosition:
     longitude_deg: float
     sigma_m: float
     heights: tuple[Height, ...] = ()
+
+    def height_m(self, datum: Datum) -> float | None:
+        """The recorded height above that surface; None without one."""
+        return next((h.value_m for h in self.heights if h.datum is datum), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +86,8 @@ class RecordedView:
         roll_deg: float,
         pitch_deg: float,
         yaw_deg: float,
-        tilt_sigma_deg: float,
-        heading_sigma_deg: float | None,
+        tilt_sigma_deg: float = TILT_DEG,
+        heading_sigma_deg: float | None = HEADING_DEG,
         *,
         measured: bool = True,
     ) -> RecordedView:
@@ -169,36 +183,33 @@ class RecordedFlight:
 
 
 class Track:
-    """Telemetry over time with interpolation; None in gaps above `gap_s`."""
+    """Telemetry over time with interpolation; None in gaps above `gap_s`. times_ns: ascending times
+    of the samples, int64.
+    """
 
     def __init__(self, samples: Sequence[Telemetry], gap_s: float = 2.5) -> None:
         dated = sorted((s.time_ns, k) for k, s in enumerate(samples) if s.time_ns is not None)
         self._samples = tuple(samples[k] for _, k in dated)
-        self._times = np.array([t for t, _ in dated], dtype=np.int64)
+        self.times_ns = np.array([t for t, _ in dated], dtype=np.int64)
         self._gap_ns = round(1e9 * gap_s)
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    @property
-    def times_ns(self) -> np.ndarray:
-        """Ascending times of the samples, int64."""
-        return self._times
-
     def at(self, time_ns: int) -> Telemetry | None:
         """Telemetry at a time (ns), interpolated; None in gaps and outside the samples, except
         within a tenth of `gap_s`, where the nearest one is returned.
         """
-        if not len(self._times):
+        if not len(self.times_ns):
             return None
-        after = int(np.searchsorted(self._times, time_ns))
-        if after < len(self._times) and self._times[after] == time_ns:
+        after = int(np.searchsorted(self.times_ns, time_ns))
+        if after < len(self.times_ns) and self.times_ns[after] == time_ns:
             return self._samples[after]
-        if after in (0, len(self._times)):
+        if after in (0, len(self.times_ns)):
             near = 0 if after == 0 else after - 1
-            away_ns = abs(int(self._times[near]) - time_ns)
+            away_ns = abs(int(self.times_ns[near]) - time_ns)
             return self._samples[near] if away_ns < self._gap_ns // 10 else None
-        begin, end = int(self._times[after - 1]), int(self._times[after])
+        begin, end = int(self.times_ns[after - 1]), int(self.times_ns[after])
         if end - begin > self._gap_ns:
             return None
         return _between(

@@ -12,7 +12,6 @@ import numpy as np
 from companion.errors import FootageError
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.klv import local_set as tag
-from companion.klv import universal_set
 from companion.recorded.flight import (
     Datum,
     Height,
@@ -87,8 +86,8 @@ def read_klv(path: Path) -> KlvTrack:
 
 def decode(packet: bytes) -> Fields:
     """Decode a packet of either standard to ST 0601 tags; ValueError for other packets."""
-    if packet.startswith(universal_set.UNIVERSAL_SET_LABEL):
-        return universal_set.decode_universal(packet)
+    if packet.startswith(tag.UNIVERSAL_SET_LABEL):
+        return tag.decode_universal(packet)
     return tag.decode(packet)
 
 
@@ -120,7 +119,7 @@ def telemetry(fields: Fields, time_ns: int) -> Telemetry:
     )  # fmt: skip
     if view is None:
         view = _universal_view(
-            number(universal_set.ANGLE_TO_NORTH), number(universal_set.OBLIQUITY),
+            number(tag.ANGLE_TO_NORTH), number(tag.OBLIQUITY),
             number(tag.RELATIVE_ROLL),
         )  # fmt: skip
     return Telemetry(time_ns, position, view, number(tag.PLATFORM_HEADING))

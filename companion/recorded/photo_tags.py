@@ -18,6 +18,8 @@ from PIL import ExifTags, Image
 
 from companion.errors import FootageError
 from companion.recorded.flight import (
+    ABSOLUTE_M,
+    HEADING_DEG,
     Datum,
     Height,
     RecordedPosition,
@@ -35,11 +37,8 @@ _TAG = r"(?:[\w-]+):(\w+)"
 # Standard deviations of what the tags say. DJI states 0.5 to 1.5 m for hovering with GNSS; photos
 # are tagged in motion (5 to 15 m/s, up to 0.2 s late).
 _GNSS_M, _RTK_M = 3.0, 0.1
-_ABSOLUTE_M = 30.0  # of DJI's altitude without RTK: barometer and model of the atmosphere
 _GNSS_HEIGHT_M = 8.0
-_BAROMETER_M, _BAROMETER_SHARE = 2.0, 0.02
 _LARGEST_SIGMA_M = 1e5  # as in a file of places
-_TILT_DEG, _HEADING_DEG = 2.0, 6.0  # of a gimbal that is not calibrated; of its compass
 _DOWN_DEG = 10.0  # of a camera of which nothing is said: survey photos look down
 
 
@@ -115,7 +114,7 @@ class PhotoTags:
             if len(values) == 3 and any(values):
                 roll, pitch, yaw = convert(values[0], values[1], values[2])
                 roll = -roll if self.maker == "sensefly" else roll  # positive to the left there
-                return RecordedView.of_angles(roll, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+                return RecordedView.of_angles(roll, pitch, yaw)
         return None
 
     @property
@@ -171,11 +170,8 @@ class PhotoTags:
         return latitude, longitude
 
     def _heights(self) -> list[Height]:
-        heights = []
         relative = self.number("RelativeAltitude", "AboveGroundAltitude")
-        if relative is not None:
-            sigma = math.hypot(_BAROMETER_M, _BAROMETER_SHARE * relative)
-            heights.append(Height(relative, Datum.TAKEOFF, sigma))
+        heights = [] if relative is None else [Height.by_barometer(relative)]
         return [*heights, self.altitude] if self.altitude is not None else heights
 
     @property
@@ -189,7 +185,7 @@ class PhotoTags:
         fixed = self.number("RtkFlag") in (16.0, 34.0, 50.0)
         if kind == "rtkalt" or (fixed and kind != "gpsfusionalt"):
             return Height(value, Datum.ELLIPSOID, _RTK_M)
-        return Height(value, Datum.AMSL, _ABSOLUTE_M)
+        return Height(value, Datum.AMSL, ABSOLUTE_M)
 
     @property
     def _exif_altitude(self) -> float | None:
@@ -225,7 +221,7 @@ def looking_down(heading_deg: float | None) -> RecordedView:
 
     heading_deg: of the aircraft, None if unknown.
     """
-    sigma = None if heading_deg is None else 2.0 * _HEADING_DEG
+    sigma = None if heading_deg is None else 2.0 * HEADING_DEG
     return RecordedView.of_angles(0.0, -90.0, heading_deg or 0.0, _DOWN_DEG, sigma, measured=False)
 
 

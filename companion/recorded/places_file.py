@@ -24,7 +24,6 @@ from localizer.plain_files import plain_text
 
 PLACES_SUFFIXES = frozenset({".csv", ".txt", ".tsv"})
 _UNKNOWN_M, _HEIGHT_M = 5.0, 25.0  # of a position and a height of which no one says the source
-_TILT_DEG, _HEADING_DEG = 2.0, 6.0
 _COLUMNS = {
     "name": ("name", "filename", "file", "image", "photo", "label", "imagename"),
     "latitude": ("lat", "latitude", "gpslatitude", "latitudedeg", "y"),
@@ -130,7 +129,7 @@ def _place(row: list[str], columns: dict[str, int], where: str) -> tuple[str, Te
     roll, pitch, yaw = number("roll"), number("pitch"), number("yaw")
     view = None
     if pitch is not None and yaw is not None:
-        view = RecordedView.of_angles(roll or 0.0, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+        view = RecordedView.of_angles(roll or 0.0, pitch, yaw)
     seconds = number("time")
     time_ns = None if seconds is None else round(seconds * 1e9)
     return row[columns["name"]], Telemetry(time_ns, position, view, number("course"))

@@ -12,6 +12,8 @@ import numpy as np
 from companion.geometry import ned_from_world
 from companion.recorded.cameras import camera_given
 from companion.recorded.flight import (
+    HEADING_DEG,
+    TILT_DEG,
     Datum,
     Height,
     RecordedFlight,
@@ -31,7 +33,7 @@ from localizer.plain_files import files_of
 
 # Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
 _FRAME_INTERVAL_NS = 33_333_333
-_PLACE_M, _HEIGHT_M, _TILT_DEG, _HEADING_DEG = 5.0, 5.0, 2.0, 6.0  # where a pose is only a prior
+_PLACE_M, _HEIGHT_M = 5.0, 5.0  # where a pose is only a prior
 
 
 def is_sequence(folder: Path) -> bool:
@@ -97,17 +99,18 @@ def _telemetry(row: PoseRow, time_ns: int | None) -> Telemetry:
     attitude = NED_FROM_ENU @ world_from_camera(row, LocalFrame(here)).rotation
     height = Height(here.height_m, Datum.ELLIPSOID, _HEIGHT_M)
     place = RecordedPosition(here.latitude_deg, here.longitude_deg, _PLACE_M, (height,))
-    return Telemetry(time_ns, place, RecordedView(attitude, _TILT_DEG, _HEADING_DEG))
+    return Telemetry(time_ns, place, RecordedView(attitude, TILT_DEG, HEADING_DEG))
 
 
 def _pose(said: Telemetry, frame: LocalFrame, geoid_m: float) -> Pose | None:
-    heights = {h.datum: h.value_m for h in said.position.heights} if said.position else {}
-    if Datum.AMSL in heights:
-        heights.setdefault(Datum.ELLIPSOID, heights[Datum.AMSL] + geoid_m)
-    measured = said.view is not None and said.view.measured
-    if said.position is None or said.view is None or not measured or Datum.ELLIPSOID not in heights:
+    if said.position is None or said.view is None or not said.view.measured:
         return None
-    p = Geodetic(said.position.latitude_deg, said.position.longitude_deg, heights[Datum.ELLIPSOID])
+    height, amsl = (said.position.height_m(datum) for datum in (Datum.ELLIPSOID, Datum.AMSL))
+    if height is None and amsl is not None:
+        height = amsl + geoid_m
+    if height is None:
+        return None
+    p = Geodetic(said.position.latitude_deg, said.position.longitude_deg, height)
     centre = np.asarray(frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m))
     return Pose(ned_from_world(frame, p).T @ said.view.ned_from_camera, centre)
 

@@ -7,7 +7,6 @@ Three kinds occur: ``[latitude: 1.2] [longitude: 3.4] ...`` in brackets (Mavic 2
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from datetime import date
@@ -18,6 +17,7 @@ import numpy as np
 
 from companion.errors import FootageError
 from companion.recorded.flight import (
+    ABSOLUTE_M,
     Datum,
     Height,
     RecordedPosition,
@@ -36,8 +36,7 @@ _AUTEL = re.compile(
 )
 _AUTEL_GIMBAL = re.compile(rf"G\.PRY\s*\(\s*{_NUMBER}.?\s*,\s*{_NUMBER}.?\s*,\s*{_NUMBER}")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m")
-_SIGMA_M, _ABSOLUTE_M, _BAROMETER_M, _SHARE = 3.0, 30.0, 2.0, 0.02
-_TILT_DEG, _HEADING_DEG = 2.0, 6.0
+_SIGMA_M = 3.0
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,10 @@ def _telemetry(body: str, pairs: dict[str, float], time_ns: int) -> Telemetry:
     gimbal = [pairs.get(f"gb_{name}") for name in ("roll", "pitch", "yaw")]
     told = [g for g in gimbal if g is not None]
     if len(told) == 3 and any(told):  # all zero: not measured
-        view = RecordedView.of_angles(told[0], told[1], told[2], _TILT_DEG, _HEADING_DEG)
+        view = RecordedView.of_angles(told[0], told[1], told[2])
     elif (found := _AUTEL_GIMBAL.search(body)) is not None:
         pitch, roll, yaw = (float(x) for x in found.groups())
-        view = RecordedView.of_angles(roll, pitch, yaw, _TILT_DEG, _HEADING_DEG)
+        view = RecordedView.of_angles(roll, pitch, yaw)
     zoom = pairs.get("dzoom_ratio", 1.0)
     zoom = zoom / 10_000.0 if zoom >= 1000.0 else zoom
     return Telemetry(time_ns, position, view, None, zoom if zoom >= 1.0 else 1.0)
@@ -110,10 +109,10 @@ def _bracketed(pairs: dict[str, float]) -> RecordedPosition | None:
         return None
     heights = []
     if "rel_alt" in pairs:
-        heights.append(_above_takeoff(pairs["rel_alt"]))
+        heights.append(Height.by_barometer(pairs["rel_alt"]))
     absolute = pairs.get("abs_alt", pairs.get("altitude"))
     if absolute is not None:
-        heights.append(Height(absolute, Datum.AMSL, _ABSOLUTE_M))
+        heights.append(Height(absolute, Datum.AMSL, ABSOLUTE_M))
     return _position(latitude, longitude, heights)
 
 
@@ -122,7 +121,7 @@ def _in_words(body: str, pairs: dict[str, float]) -> RecordedPosition | None:
     if autel is not None:
         east, longitude, north, latitude, height = autel.groups()
         signs = (-1.0 if north.upper() == "S" else 1.0, -1.0 if east.upper() == "W" else 1.0)
-        heights = [_above_takeoff(float(height))]
+        heights = [Height.by_barometer(float(height))]
         return _position(signs[0] * float(latitude), signs[1] * float(longitude), heights)
     gps = _GPS.search(body)
     if gps is None:
@@ -131,17 +130,13 @@ def _in_words(body: str, pairs: dict[str, float]) -> RecordedPosition | None:
     barometer = pairs.get("barometer")
     height = _HEIGHT.search(body)
     above = barometer if barometer is not None else float(height[1]) if height else None
-    return _position(latitude, longitude, [] if above is None else [_above_takeoff(above)])
+    return _position(latitude, longitude, [] if above is None else [Height.by_barometer(above)])
 
 
 def _position(latitude: float, longitude: float, heights: list[Height]) -> RecordedPosition | None:
     if (latitude == 0.0 and longitude == 0.0) or abs(latitude) > 90.0 or abs(longitude) > 360.0:
         return None  # no fix yet
     return RecordedPosition(latitude, longitude, _SIGMA_M, tuple(heights))
-
-
-def _above_takeoff(value: float) -> Height:
-    return Height(value, Datum.TAKEOFF, math.hypot(_BAROMETER_M, _SHARE * value))
 
 
 def _focal(pairs: dict[str, float]) -> float | None:

@@ -38,13 +38,11 @@ class ExtractedFrame:
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """Properties of a video file. width, height: of its frames; has_dji_track: whether it has DJI's
-    own telemetry (protobuf, different for each model); assumed: about its times, empty if it has
-    some; day: of the recording, UTC, None if unknown.
+    """Properties of a video file. has_dji_track: whether it has DJI's own telemetry (protobuf,
+    different for each model); assumed: about its times, empty if it has some; day: of the
+    recording, UTC, None if unknown.
     """
 
-    width: int
-    height: int
     duration_s: float
     rotation_deg: int
     has_dji_track: bool
@@ -67,8 +65,7 @@ def video_facts(path: Path) -> VideoFacts:
             said = container.duration
             duration_s = said / av.time_base if said else _length_s(path)
             day = _day(container.metadata.get("creation_time", ""))
-            size = frame.width, frame.height
-            return VideoFacts(*size, duration_s, rotation, has_track, assumed, day)
+            return VideoFacts(duration_s, rotation, has_track, assumed, day)
     except av.error.FFmpegError as error:
         raise FootageError(f"{path}: not a video, or damaged: {error}") from error
 

@@ -143,13 +143,13 @@ class Report:
     timeline.
 
     spans: named lanes of time spans (states, GNSS denied); notes: what the report could not show;
-    overlays_of: the frames that the overlays show; verdict: the result in one sentence; tables:
-    further tables with their titles.
+    overlays_of: the frames that the overlays show; verdict: the result in one sentence; tables,
+    pictures: further ones with their titles.
     """
 
     title: str
     subtitle: str
-    first: str
+    first: str = ""
     verdicts: tuple[CriterionResult, ...] = ()
     sheet: MapSheet | None = None
     plots: tuple[Plot, ...] = ()
@@ -166,3 +166,4 @@ class Report:
     overlays_of: str = "The worst of all frames"
     verdict: str = ""
     tables: tuple[tuple[str, ReportTable], ...] = ()
+    pictures: tuple[tuple[str, Image], ...] = ()

@@ -45,7 +45,9 @@ def track(name: str, colour: str, width: float, columns: Columns, prefix: str = 
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray, within_ns: int = _NEAR_NS) -> np.ndarray:
-    """For each wanted time (ns) the index of the nearest of sorted `times` within 2 ms, or -1."""
+    """For each wanted time (ns) the index of the nearest of sorted `times`, or -1 if none is within
+    `within_ns`, 2 ms if not given.
+    """
     if not len(times):
         return np.full(len(wanted), -1)
     right = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)

@@ -17,6 +17,7 @@ from companion.klv.metadata import KlvContext, frame_fields
 from companion.klv.transport import TransportWriter
 from companion.offline.record import RecordTables, read_record
 from companion.offline.tables import Columns, poses
+from companion.reporting.figures import nearest
 from companion.sources.base import fitted_camera, has_times, video_stream
 from companion.sources.misp import misp_time
 from localizer.geometry.camera import Camera
@@ -162,18 +163,16 @@ class _RecordTrack:
 
     def at(self, time_ns: int, camera: Camera) -> bytes | None:
         """Metadata packet of a frame; None if the frame was not localized."""
-        k = _nearest(self._times, time_ns, _SAME_NS)
-        if k is None:
+        (k,) = nearest(self._times, np.array([time_ns]), _SAME_NS)
+        if k < 0:
             return None
         estimate = PoseEstimate(
             self._poses[k], np.zeros((6, 6)), 1.0, TrackingState.TRACKING, RegistrationStatus.OK,
             True, int(self._times[k]), 0, camera,
         )  # fmt: skip
-        body = None
         times, angles = self._attitudes
-        j = _nearest(times, time_ns, _ATTITUDE_NS)
-        if j is not None:
-            body = matrix_from_euler(*angles[j])
+        (j,) = nearest(times, np.array([time_ns]), _ATTITUDE_NS)
+        body = None if j < 0 else matrix_from_euler(*angles[j])
         fields = frame_fields(estimate, self._scene, body, self._target(time_ns))
         return encode((time_ns + self._utc_ns) // 1000, fields)
 
@@ -183,15 +182,6 @@ class _RecordTrack:
         if k < 0 or time_ns - times[k] > _TARGET_NS:
             return None
         return fixes[k]
-
-
-def _nearest(times: np.ndarray, time_ns: int, within_ns: int) -> int | None:
-    k = int(np.searchsorted(times, time_ns))
-    near = [j for j in (k - 1, k) if 0 <= j < len(times)]
-    best = min(near, key=lambda j: abs(int(times[j]) - time_ns), default=None)
-    if best is None or abs(int(times[best]) - time_ns) > within_ns:
-        return None
-    return best
 
 
 def _targets(table: Columns) -> tuple[np.ndarray, list[TargetFix]]:

@@ -72,10 +72,13 @@ def _sections(report: Report) -> list[str]:
     return [
         f"<h1>{escape(report.title)}</h1><p class=sub>{escape(report.subtitle)}</p>",
         f"<p class=verdict>{escape(report.verdict)}</p>" if report.verdict else "",
-        f'<p class="first{fine}"><b>What went wrong first:</b> {escape(report.first)}</p>',
+        f'<p class="first{fine}"><b>What went wrong first:</b> {escape(report.first)}</p>'
+        if report.first
+        else "",
         "".join(f"<p class=note>{escape(note)}</p>" for note in report.notes),
         _verdicts(report),
         *(_section(title, _table(table)) for title, table in report.tables),
+        *(_section(title, _picture(title, rgb)) for title, rgb in report.pictures),
         _section("Map", _map(report.sheet)) if report.sheet else "",
         _section("Timeline", _timeline(report)) if report.lanes or report.events else "",
         _section("Errors and figures", _plots(report)) if report.plots else "",
@@ -90,6 +93,10 @@ def _sections(report: Report) -> list[str]:
 def _section(title: str, body: str) -> str:
     name = title.split(",", maxsplit=1)[0].lower().replace(" ", "-")
     return f'<section id="{name}"><h2>{escape(title)}</h2>{body}</section>'
+
+
+def _picture(title: str, rgb: Image) -> str:
+    return f'<img class=picture alt="{escape(title)}" src="{data_uri(rgb)}">'
 
 
 def _verdicts(report: Report) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.errors import RecordError, StreamDecodeError
-from companion.offline.flown_map import FlownMap
+from companion.offline.record import FlownMap
 from companion.reporting.content import MapMark, MapSheet, MapTrack, Overlay
 from companion.sources.folder_source import read_image
 from companion.terminal.steps import Say

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import StreamError, StreamSizeError
@@ -16,19 +15,13 @@ _GUESS = Camera.from_fov(1280, 720, 65.0)  # any: a picture says its size, this 
 _ANY_GREY = (0, 65535)  # of a size, levels do not matter
 
 
-@dataclass(frozen=True)
-class StreamSize:
-    """Frame size of a stream, pixels."""
-
-    width: int
-    height: int
-
-
-def read_stream_size(source: str) -> StreamSize:
-    """Frame size of a stream or of a folder's first image; `StreamError` if none in 10 s."""
+def read_stream_size(source: str) -> tuple[int, int]:
+    """Width and height, pixels, of a stream's frames or of a folder's first image; `StreamError` if
+    none in 10 s.
+    """
     if "://" not in source and Path(source).is_dir():  # pictures are taken at their own size there
         height, width = read_image(list_images(Path(source))[0], _ANY_GREY).shape[:2]
-        return StreamSize(width, height)
+        return width, height
     told: list[str] = []
 
     def on_state(state: StreamState, text: str) -> None:
@@ -41,11 +34,11 @@ def read_stream_size(source: str) -> StreamSize:
     try:
         for frame in feed.frames():
             height, width = frame.image.shape[:2]
-            return StreamSize(width, height)
+            return width, height
     except StreamSizeError as error:  # of another shape than the guess, as most thermal ones are
         if error.size is None:
             raise
-        return StreamSize(*error.size)
+        return error.size
     finally:
         timer.cancel()
         feed.close()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +17,9 @@ from companion.targets.detections import GROUND_STATION, Detection, clicked_name
 from companion.targets.pictures import RecentPictures
 from localizer.geometry.pose import Array
 from localizer.targets.follow import FollowedPosition, Gray, ImageFollower
-from localizer.targets.limits import RefusalReason
+from localizer.targets.limits import RefusalReason, SharedBias
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.targets.track import SharedBias, TargetSettings, TargetTrack, pixel_of
+from localizer.targets.track import TargetSettings, TargetTrack, pixel_of
 from localizer.types import PoseEstimate, TargetFix, Visibility
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
@@ -50,14 +51,16 @@ _LEFT, _LEAVES_MPS = 0.5, 5.0  # the chance that it left then, and how fast, axi
 _GROUND_EVERY = 3  # so many of the kept pictures show the ground well enough
 _LOST_S = 4.0
 _SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
-_REPORT_AGAIN_NS = (
-    10_000_000_000  # one of all targets in so long: a flood of texts hides the others
-)
+_REPORT_AGAIN_NS = 10_000_000_000  # one of all targets in so long: a flood hides the others
 _LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
 _BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
 _BACK_GAP_S = 0.5
 _BENDS = 0.4  # of its way: a bend behind the roof leads it so far aside of its last course
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
+
+
+_Picture = tuple[PoseEstimate, Gray]
+"""The estimate of an accepted frame, and the frame in grey."""
 
 
 def _off(a: Array, b: Array) -> float:
@@ -91,11 +94,6 @@ class TargetEstimate:
 
     fix: TargetFix
     estimate: PoseEstimate
-
-    @property
-    def velocity(self) -> Array | None:
-        """(3,) m/s, world axes; None for a static target or after one detection."""
-        return self.fix.velocity
 
 
 @dataclass
@@ -136,11 +134,6 @@ class _Back:
     position: Array
 
 
-def _number(name: str) -> int:
-    """Number of a clicked target, by its name."""
-    return clicked_number(name) or 0
-
-
 class TargetManager:
     """The active targets, by name. Not thread-safe.
 
@@ -172,9 +165,7 @@ class TargetManager:
             confirm_s=config.confirm_s,
         )
         self._lives: dict[str, _TargetState] = {}
-        self._pictures = RecentPictures[tuple[PoseEstimate, Gray]](
-            _PICTURES, lambda picture: picture[1].nbytes
-        )
+        self._pictures = RecentPictures[_Picture](_PICTURES, lambda picture: picture[1].nbytes)
         self._silence_reported_ns = -_REPORT_AGAIN_NS
         self.missed = 0
         self.doubted = 0
@@ -189,9 +180,7 @@ class TargetManager:
         fix = track.observe(click.estimate, click.pixel, drift=self._drift(click))
         if fix is None:
             self.missed += 1
-            self._report_alert(
-                alert(AlertId.TARGET_REFUSED, number=click.number, why=Name(str(track.refusal)))
-            )
+            self._tell(AlertId.TARGET_REFUSED, name, why=Name(str(track.refusal)))
             self._on_gone(name)
             return
         life = _TargetState(track, time_ns, True, time_ns, found_ns=time_ns, begun_ns=time_ns)
@@ -201,7 +190,7 @@ class TargetManager:
             life.extent_m = (click.extent[0] * cell, click.extent[1] * cell)
         self._lives[name] = life
         sigma = float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1]))
-        self._report_alert(alert(AlertId.TARGET_FOUND, number=click.number, metres=sigma))
+        self._tell(AlertId.TARGET_FOUND, name, metres=sigma)
         self._report(life, fix, click.estimate)
         self._follow(name, life, click, fix)
 
@@ -236,7 +225,7 @@ class TargetManager:
         """Track each clicked target in the image of an accepted estimate: (H, W) uint8 grey."""
         self._pictures.append((estimate, gray))
         for name, life in [(n, x) for n, x in self._lives.items() if x.follower is not None]:
-            self._look_for(name, life, estimate, gray)
+            self._look_for(name, life, (estimate, gray))
 
     def predict(self, estimate: PoseEstimate) -> None:
         """Report each clicked target at the estimate's frame, at most `rate_hz` times a second; end
@@ -255,8 +244,7 @@ class TargetManager:
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
-                self._report_alert(alert(AlertId.TARGET_OUT_OF_VIEW, number=_number(name)))
-                self.end((name,))
+                self._end_with(AlertId.TARGET_OUT_OF_VIEW, name)
                 continue
             self._report(life, fix, estimate)
 
@@ -265,6 +253,14 @@ class TargetManager:
         for name in names:
             if self._lives.pop(name, None) is not None:
                 self._on_gone(name)
+
+    def _tell(self, of: AlertId, name: str, **values: Any) -> None:
+        """Send an alert of a clicked target."""
+        self._report_alert(alert(of, number=clicked_number(name) or 0, **values))
+
+    def _end_with(self, of: AlertId, name: str, **values: Any) -> None:
+        self._tell(of, name, **values)
+        self.end((name,))
 
     def _follow(self, name: str, life: _TargetState, click: Click, fix: TargetFix) -> None:
         """Begin to track a clicked target in the image: from the clicked frame, if it is kept,
@@ -275,76 +271,65 @@ class TargetManager:
         if not kept:
             return
         estimate, gray = min(kept, key=lambda p: abs(p[0].exposure_time_ns - time_ns))
+        taken_ns = estimate.exposure_time_ns
         half_m = None if life.extent_m is None else 0.5 * max(life.extent_m)
         follower = ImageFollower(gray, estimate, fix.position_world, half_m)
         if not follower.ready:
             return
-        others = [
-            p for p in self._pictures
-            if abs(p[0].exposure_time_ns - estimate.exposure_time_ns) > _PASSED_NS
-        ]  # fmt: skip
+        others = [p for p in self._pictures if abs(p[0].exposure_time_ns - taken_ns) > _PASSED_NS]
         life.moved_at_once = follower.isolate(others)
         life.follower = follower
-        for newer, picture in [
-            p for p in self._pictures if p[0].exposure_time_ns > estimate.exposure_time_ns
-        ]:
+        for picture in [p for p in self._pictures if p[0].exposure_time_ns > taken_ns]:
             if name in self._lives:
-                self._look_for(name, life, newer, picture)
+                self._look_for(name, life, picture)
 
-    def _look_for(self, name: str, life: _TargetState, estimate: PoseEstimate, gray: Gray) -> None:
+    def _look_for(self, name: str, life: _TargetState, picture: _Picture) -> None:
         """Find a target in an image; one that moves and is not found is predicted, then lost."""
-        time_ns, track, follower = estimate.exposure_time_ns, life.track, life.follower
+        estimate, track, follower = picture[0], life.track, life.follower
+        time_ns = estimate.exposure_time_ns
         expected = track.expected(time_ns)
         if follower is None or expected is None:
             return
         since_s = (time_ns - life.found_ns) * 1e-9
         if track.moves:
-            found = self._find_moving(life, follower, estimate, gray)
+            found = self._find_moving(life, follower, picture)
         else:
-            found = self._find_leaving(name, life, (estimate, gray), expected[0])
+            found = self._find_leaving(name, life, follower, picture, expected[0])
         fix = None
         if found is not None:
             fix = track.observe(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
             life.found_ns = life.seen_ns = time_ns
             life.refused_ns = 0 if fix is not None else life.refused_ns or time_ns
         elif track.moves and since_s > _LOST_S and not self._may_be_back(life, time_ns):
-            self._report_alert(alert(AlertId.TARGET_LOST, number=_number(name)))
-            self.end((name,))
+            self._end_with(AlertId.TARGET_LOST, name)
             return
         elif track.moves:
             fix = track.coast(estimate)
-        elif since_s > _MISSED_S and self._is_gone(name, life, follower, estimate, gray):
+        elif since_s > _MISSED_S and self._is_gone(name, life, follower, picture):
             return
         if fix is not None and self._is_due(life, time_ns):
             life.reported_ns = time_ns
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
-            self._report_alert(
-                alert(
-                    AlertId.TARGET_NOT_LOCATED, number=_number(name), why=Name(str(track.refusal))
-                )
-            )
-            self.end((name,))
+            self._end_with(AlertId.TARGET_NOT_LOCATED, name, why=Name(str(track.refusal)))
 
     def _find_leaving(
-        self, name: str, life: _TargetState, picture: tuple[PoseEstimate, Gray], position: Array
-    ) -> FollowedPosition | None:
+        self, name: str, life: _TargetState, follower: ImageFollower, picture: _Picture,
+        position: Array,
+    ) -> FollowedPosition | None:  # fmt: skip
         """Find a target that was not measured to move yet, if it has left its place (3,); None if
         it is still there, or is not found.
         """
-        (estimate, gray), follower = picture, life.follower
-        if follower is None:
-            return None
+        estimate, gray = picture
         time_ns = estimate.exposure_time_ns
-        if (
-            left := self._find_departed_moving(life, follower, estimate, gray, position)
-        ) is not None:
+        left = self._find_departed_moving(life, follower, picture, position)
+        if left is not None:
             return left if self._moves_steadily(life, left, position, time_ns) else None
         near = follower.find(gray, estimate, position, _STILL_M)
         is_over = time_ns - life.begun_ns > _DEPARTS_S * 1e9
         has_changed = follower.watch(gray, estimate, position)
         if near is None:
-            left = self._find_departed(life, follower, estimate, gray, position)
+            left = self._find_departed(life, follower, picture, position)
             drives = left is not None and self._moves_steadily(life, left, position, time_ns)
             return left if drives else None
         if has_changed:
@@ -361,12 +346,7 @@ class TargetManager:
         return None
 
     def _is_gone(
-        self,
-        name: str,
-        life: _TargetState,
-        follower: ImageFollower,
-        estimate: PoseEstimate,
-        gray: Gray,
+        self, name: str, life: _TargetState, follower: ImageFollower, picture: _Picture
     ) -> bool:
         """Whether a target that was never measured to move ends, because the ground in its place is
         visible.
@@ -374,10 +354,9 @@ class TargetManager:
         If the target only looks different, the operator is told: after a sudden change it may have
         left.
         """
-        number = _number(name)
+        estimate, gray = picture
         if life.moved_at_once and follower.shows_ground(gray, estimate):
-            self._report_alert(alert(AlertId.TARGET_LEFT, number=number))
-            self.end((name,))
+            self._end_with(AlertId.TARGET_LEFT, name)
             return True
         held = life.track.hold(estimate)
         is_in_view = held is not None and held.visibility is Visibility.HELD
@@ -387,11 +366,11 @@ class TargetManager:
             return False
         if follower.is_changed and not life.changed_ns:
             life.changed_ns = life.found_ns
-            self._report_alert(alert(AlertId.TARGET_MAY_HAVE_LEFT, number=number))
+            self._tell(AlertId.TARGET_MAY_HAVE_LEFT, name)
         elif not life.is_slide_reported and not life.changed_ns:
             # The view of what is not flat changes by and by: its place is as good as before.
             life.is_slide_reported = True
-            self._report_alert(alert(AlertId.TARGET_HELD, number=number))
+            self._tell(AlertId.TARGET_HELD, name)
         return False
 
     @staticmethod
@@ -422,7 +401,7 @@ class TargetManager:
         life.found_ns, life.unseen_ns = time_ns, 0
         if life.changed_ns:
             life.changed_ns = 0
-            self._report_alert(alert(AlertId.TARGET_BACK, number=_number(name)))
+            self._tell(AlertId.TARGET_BACK, name)
 
     @staticmethod
     def _with_departure(life: _TargetState, fix: TargetFix, most_m: float) -> TargetFix:
@@ -436,9 +415,10 @@ class TargetManager:
         return replace(fix, visibility=seen, covariance=fix.covariance + level)
 
     def _find_moving(
-        self, life: _TargetState, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
+        self, life: _TargetState, follower: ImageFollower, picture: _Picture
     ) -> FollowedPosition | None:
         """Find a moving target near its predicted position; None if something hides it."""
+        estimate, gray = picture
         time_ns = estimate.exposure_time_ns
         expected = life.track.expected(time_ns)
         if expected is None or life.track.is_being_hidden(estimate, expected[0]):
@@ -447,7 +427,7 @@ class TargetManager:
         reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
         is_long = (time_ns - life.found_ns) * 1e-9 > _LONG_S
         can_tell, found = self._before_ground(
-            life, follower, (estimate, gray), expected[0], reach_m, was_hidden=is_long
+            follower, picture, expected[0], reach_m, was_hidden=is_long
         )
         if not can_tell:
             found = follower.find(gray, estimate, expected[0], reach_m, was_hidden=is_long)
@@ -479,22 +459,21 @@ class TargetManager:
         return back is not None and (time_ns - back.time_ns) * 1e-9 <= _BACK_GAP_S
 
     def _find_departed_moving(
-        self, life: _TargetState, follower: ImageFollower, estimate: PoseEstimate, gray: Gray,
-        position: Array,
-    ) -> FollowedPosition | None:  # fmt: skip
+        self, life: _TargetState, follower: ImageFollower, picture: _Picture, position: Array
+    ) -> FollowedPosition | None:
         """Find a target that moved when it was clicked and now covers other ground; None if it
         stands.
         """
-        since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
+        since_s = (picture[0].exposure_time_ns - life.found_ns) * 1e-9
         if not life.moved_at_once or since_s > _DEPARTS_S:
             return None
         reach_m = _NEAR_M + _FASTEST_MPS * since_s
-        _, found = self._before_ground(life, follower, (estimate, gray), position, reach_m)
+        _, found = self._before_ground(follower, picture, position, reach_m)
         return found if found is not None and _off(found.position, position) >= _STANDS_M else None
 
     def _before_ground(
-        self, life: _TargetState, follower: ImageFollower, picture: tuple[PoseEstimate, Gray],
-        position: Array, reach_m: float, *, was_hidden: bool = False,
+        self, follower: ImageFollower, picture: _Picture, position: Array, reach_m: float,
+        *, was_hidden: bool = False,
     ) -> tuple[bool, FollowedPosition | None]:  # fmt: skip
         """Whether earlier images can separate the target from the ground; where it is."""
         if not follower.is_isolated:
@@ -509,21 +488,18 @@ class TargetManager:
 
     @staticmethod
     def _find_departed(
-        life: _TargetState,
-        follower: ImageFollower,
-        estimate: PoseEstimate,
-        gray: Gray,
-        position: Array,
+        life: _TargetState, follower: ImageFollower, picture: _Picture, position: Array
     ) -> FollowedPosition | None:
         """Find a clicked target that moves, before its motion was measured. The ground that it has
         left shows its shape. A car that only passes over a clicked place does not take the place's
         appearance along, so no match is found.
         """
-        if (estimate.exposure_time_ns - life.found_ns) * 1e-9 > _DEPARTS_S:
-            return None
-        if not follower.is_isolated and not follower.isolate(((estimate, gray),)):
-            return None
+        estimate, gray = picture
         since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
+        if since_s > _DEPARTS_S:
+            return None
+        if not follower.is_isolated and not follower.isolate((picture,)):
+            return None
         found = follower.find(gray, estimate, position, _NEAR_M + _FASTEST_MPS * since_s)
         if found is not None and (life.moved_at_once or found.score >= _DEPARTED):
             return found

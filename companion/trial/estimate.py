@@ -8,8 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
-from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
+from companion.calibrate.evidence import (
+    OFFSETS_S,
+    AutopilotWindow,
+    CalibrationFrame,
+    CalibrationProblem,
+    changed_camera,
+)
 from companion.calibrate.pictures import Parts, PictureReader
 from companion.calibrate.solve import Solution, solve
 from companion.errors import StreamDecodeError, StreamSizeError

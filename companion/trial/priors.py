@@ -14,6 +14,7 @@ import numpy as np
 
 from companion.errors import FootageError
 from companion.geometry import ned_from_world
+from companion.planning.way import MapHeights
 from companion.recorded.flight import (
     Datum,
     Height,
@@ -26,7 +27,6 @@ from localizer.errors import MapCacheError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
 from localizer.types import PosePrior
 
 _LEAST_CLEARANCE_M, _MOST_CLEARANCE_M = 3.0, 10_000.0
@@ -37,7 +37,6 @@ _FOOT_M = 0.3048
 _CLIMB_M = 100.0  # between take-off and photos; less is no sign of feet: on a hillside by the sea
 _KNOWN_SHARE = 0.35  # of the height above ground: a wider sigma is as good as none
 _FAR_M = 10_000.0  # beyond the map's edge: no camera sees it from there
-_ABOVE_M = 100.0  # the highest roof or tree that a ray from above meets
 
 
 @dataclass(frozen=True)
@@ -98,25 +97,6 @@ class Correction:
         )  # fmt: skip
 
 
-class Ground:
-    """Surface heights of the map, buildings included where the map has them."""
-
-    def __init__(self, cache: TileCache) -> None:
-        self._surface = MapSurface(cache)
-        self._frame = cache.frame
-        self._top = float(cache.index.box_max[:, 2].max()) + _ABOVE_M
-
-    def height(self, east: float, north: float) -> float | None:
-        """World z of the surface, m, at map coordinates, m; None outside, or if unreadable."""
-        down = np.array([[0.0, 0.0, -1.0]])
-        try:
-            eye = np.array([east, north, self._top])
-            distance = float(self._surface.cast(eye, down).distances[0])
-        except MapCacheError:
-            return None  # told by `map verify`
-        return self._top - distance if math.isfinite(distance) else None
-
-
 @dataclass(frozen=True)
 class FlightPriors:
     """Priors of all frames in order. datum: of the recorded heights used, None if none is usable;
@@ -131,10 +111,10 @@ class FlightPriors:
 def priors_of(flight: RecordedFlight, cache: TileCache) -> FlightPriors:
     """Priors of a flight's frames over this map. `FootageError` if all lie far from it."""
     _check_near(flight, cache)
-    ground, frame = Ground(cache), cache.frame
+    ground, frame = MapHeights(cache), cache.frame
     geoid_m = cache.manifest.geoid_separation_m
     places = [_enu(f.telemetry.position, frame) for f in flight.frames]
-    below = [None if p is None else ground.height(float(p[0]), float(p[1])) for p in places]
+    below = [None if p is None else _height_below(p, ground) for p in places]
     known = [z for z in below if z is not None]
     notes: list[str] = []
     heights: list[Height | None] = [None] * len(places)
@@ -191,6 +171,13 @@ def _enu(position: RecordedPosition | None, frame: LocalFrame) -> Array | None:
             position.latitude_deg, position.longitude_deg, frame.origin.height_m
         )
     )
+
+
+def _height_below(place: Array, ground: MapHeights) -> float | None:
+    try:
+        return ground.height_m(float(place[0]), float(place[1]))
+    except MapCacheError:
+        return None  # told by `map verify`
 
 
 def _world_heights(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,27 +40,20 @@ _VAIN = 6  # searches without a result, after which the others of their kind are
 _AGAIN_M, _AGAIN_DEG = 2.0, 2.0  # about a place that was searched and found
 
 
-@dataclass(frozen=True)
-class TrialOptions:
-    """width: of the image registered, pixels; searches: frames also searched without position."""
-
-    width: int = 320
-    searches: int = 20
-
-
 def run_trial(
     flight: RecordedFlight,
     map_cache: Path,
-    options: TrialOptions | None = None,
+    width: int = 320,
+    searches: int = 20,
     stage: Stage = lambda _what: nullcontext(lambda _done, _total: None),
 ) -> Trial:
-    """Localize the footage over the map. stage(name): context manager that gives a function for
-    progress (frames done, in all).
+    """Localize the footage over the map. width: of the image registered, pixels; searches: frames
+    also searched without position; stage(name): context manager that gives a function for progress
+    (frames done, in all).
 
     Raises named errors for a map or footage that cannot be used.
     """
-    options = options or TrialOptions()
-    config = LocalizerConfig(width=options.width, feature_threads=2)
+    config = LocalizerConfig(width=width, feature_threads=2)
     with ExitStack() as opened:
         stack = MapStack(map_cache, config)
         opened.callback(stack.close)
@@ -72,8 +65,8 @@ def run_trial(
         )
         flight, known, first = localize_from_telemetry(flight, known, first_loader, stage)
         extractor = DetailExtractor(load_extractor(None, threads=2))
-        width = _measured_width(flight.camera.camera, known.priors, kind, options.width)
-        tools = EstimateTools(stack.renderer, extractor, width, kind.has_buildings)
+        measured = _measured_width(flight.camera.camera, known.priors, kind, width)
+        tools = EstimateTools(stack.renderer, extractor, measured, kind.has_buildings)
         with stage("estimating camera and map offset") as count:
             found = estimate(
                 flight.frames, known.priors, first, flight.camera, tools, first_loader, count
@@ -94,7 +87,7 @@ def run_trial(
                     stage("localizing again"),
                 ).values()
             )  # fmt: skip
-        searched, left = _searched(flight, priors, loader, options.searches, stage)
+        searched, left = _searched(flight, priors, loader, searches, stage)
     notes = (*flight.notes, *known.notes, *left, *_map_notes(kind, flight))
     trial = Trial(flight, priors, first, second, searched, found, {}, notes)
     return replace(trial, reasons=reasons(flight.frames, priors, trial.best, found, kind))

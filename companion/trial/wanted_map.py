@@ -66,17 +66,12 @@ def wanted_map(flight: RecordedFlight) -> WantedMap:
 
 def flat_map_advice(flight: RecordedFlight) -> str:
     """Advice to build a flat map at the take-off's height; "" if the height is unknown."""
-    heights = [
-        {h.datum: h.value_m for h in f.telemetry.position.heights}
-        for f in flight.frames
-        if f.telemetry.position is not None
-    ]
+    places = [f.telemetry.position for f in flight.frames if f.telemetry.position is not None]
     for datum, option, above in (
         (Datum.AMSL, "amsl", "the sea"), (Datum.ELLIPSOID, "ellipsoidal", "the ellipsoid")
     ):  # fmt: skip
-        ground = [
-            h[datum] - h[Datum.TAKEOFF] for h in heights if {datum, Datum.TAKEOFF} <= h.keys()
-        ]
+        both = [(p.height_m(datum), p.height_m(Datum.TAKEOFF)) for p in places]
+        ground = [a - b for a, b in both if a is not None and b is not None]
         if ground:
             ground_m = float(np.median(ground))
             return (
@@ -90,13 +85,8 @@ def flat_map_advice(flight: RecordedFlight) -> str:
 def _height_m(recorded: Sequence[Telemetry]) -> float:
     """Height above ground without a map: median above take-off, else above the sea, else 100 m."""
     for datum in (Datum.TAKEOFF, Datum.AMSL):
-        heights = [
-            h.value_m
-            for one in recorded
-            if one.position is not None
-            for h in one.position.heights
-            if h.datum is datum
-        ]
+        told = [one.position.height_m(datum) for one in recorded if one.position is not None]
+        heights = [height for height in told if height is not None]
         if heights:
             return max(float(np.median(heights)), _USUAL_HEIGHT_M / 10)
     return _USUAL_HEIGHT_M

@@ -16,6 +16,7 @@ from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import (
     LastPosition,
     RefusalReason,
+    SharedBias,
     TargetRefusal,
     is_at_seen_depth,
     is_near_map_hole,
@@ -30,23 +31,6 @@ from localizer.targets.locate import (
 )
 from localizer.targets.static import ObservedRay, StaticTarget
 from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
-
-
-@dataclass(frozen=True)
-class SharedBias:
-    """Sigmas of the common error: metres along each axis, and radians as seen from the camera."""
-
-    sigma_m: float = 0.2
-    sigma_rad: float = 0.0005
-
-    def covariance(self, offset: Array) -> Array:
-        """(3, 3) m², world axes, of a target at `offset` (3,) from the camera."""
-        distance = float(np.linalg.norm(offset))
-        d = offset / max(distance, 1e-6)
-        across = np.eye(3) - np.outer(d, d)
-        shared: Array = self.sigma_m**2 * np.eye(3) + (self.sigma_rad * distance) ** 2 * across
-        return shared
-
 
 _STANDS_S = 2.0  # for so long it must agree with standing before it stands again
 _STANDS_MPS = 1.0
@@ -76,13 +60,15 @@ class TargetSettings:
 
 
 class TargetTrack:
-    """Track of one target; not thread-safe. refusal: why the last `observe` gave no position."""
+    """Track of one target; not thread-safe. moves: whether motion was measured and it has not stood
+    since for 2 s; refusal: why the last `observe` gave no position.
+    """
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id, self._settings, self._cast = target_id, settings, cast
         self._static = StaticTarget(settings.map_sigma_m)
         self._moving = TargetFilter()
-        self._moves = False
+        self.moves = False
         self._stands_since_ns = 0
         self._outliers = 0
         self._last = LastPosition(round(settings.confirm_s * 1e9))
@@ -91,14 +77,9 @@ class TargetTrack:
         self.refusal: TargetRefusal | None = None
 
     @property
-    def moves(self) -> bool:
-        """Whether motion was measured and it has not stood since for 2 s."""
-        return self._moves
-
-    @property
     def velocity(self) -> Array | None:
         """(3,) m/s, world axes, of a moving target; None otherwise."""
-        return self._moving.velocity if self._moves else None
+        return self._moving.velocity if self.moves else None
 
     def observe(
         self,
@@ -128,25 +109,25 @@ class TargetTrack:
             return self._refuse(TargetRefusal(RefusalReason.HOLE))
         if any(drift):
             self._aim = _aim(estimate, pixel, sigma, drift, surfaces[0])
-        if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
+        if self.moves and time_ns - self._seen_ns > _GAP_S * 1e9:
             self._moving = TargetFilter()
         ray = ObservedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
         moving = self._moving.update(TargetSighting(self._id, surfaces, pixel, time_ns))
         fits = self._static.update(ray, surfaces)
         self._outliers = 0 if fits else self._outliers + 1
         if (fits and self._static.moves) or self._outliers >= _OUTLIERS:
-            self._moves = True
+            self.moves = True
             self._stands_since_ns = time_ns
             self._outliers = 0
             self._static = StaticTarget(settings.map_sigma_m)
             fits = self._static.update(ray, surfaces)
-        elif self._moves and time_ns - self._stands_since_ns > _STANDS_S * 1e9:
+        elif self.moves and time_ns - self._stands_since_ns > _STANDS_S * 1e9:
             velocity = self._moving.velocity
-            self._moves = velocity is None or float(np.hypot(*velocity[:2])) > _STANDS_MPS
-        fix = moving if self._moves else self._standing(estimate, pixel) if fits else None
+            self.moves = velocity is None or float(np.hypot(*velocity[:2])) > _STANDS_MPS
+        fix = moving if self.moves else self._standing(estimate, pixel) if fits else None
         if fix is None:
             return self._refuse(TargetRefusal(RefusalReason.ELSEWHERE))
-        if self._moves:
+        if self.moves:
             bias = settings.bias.covariance(fix.position_world - eye)
             fix = replace(fix, covariance=fix.covariance + bias + self._aim)
         why = self._objection(fix, ray, surfaces)
@@ -163,7 +144,7 @@ class TargetTrack:
     def _begin_anew(self) -> None:
         self._static = StaticTarget(self._settings.map_sigma_m)
         self._moving = TargetFilter()
-        self._moves = False
+        self.moves = False
         self._outliers = 0
         self._last = LastPosition(round(self._settings.confirm_s * 1e9))
 
@@ -173,7 +154,7 @@ class TargetTrack:
         """
         if self._last.fix is None:
             return None
-        if self._moves:
+        if self.moves:
             return self._moving.expected(time_ns)
         best = self._static.hypotheses()[0]
         return best.position, best.covariance
@@ -182,7 +163,7 @@ class TargetTrack:
         """Predicted position of an unseen moving target, HIDDEN; None for a static one, outside the
         image or map, or beyond `max_sigma_m`.
         """
-        expected = self.expected(estimate.exposure_time_ns) if self._moves else None
+        expected = self.expected(estimate.exposure_time_ns) if self.moves else None
         if expected is None:
             return None
         position, P = expected
@@ -202,7 +183,7 @@ class TargetTrack:
         projects it, HIDDEN by the map, or OUTSIDE. None for a moving one and before the first
         report.
         """
-        if self._moves or self._last.fix is None:
+        if self.moves or self._last.fix is None:
             return None
         fix = self._standing(estimate, None)
         away = fix.position_world - estimate.world_from_camera.translation
@@ -270,7 +251,7 @@ class TargetTrack:
             return TargetRefusal(RefusalReason.OFF_MAP)
         if not is_at_seen_depth(fix, ray.eye, ray.direction, surfaces):
             return TargetRefusal(RefusalReason.OTHER_DEPTH)
-        return self._last.check(fix, moves=self._moves)
+        return self._last.check(fix, moves=self.moves)
 
     def _refuse(self, why: TargetRefusal) -> TargetFix | None:
         self.refusal = why

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from companion.cli.before.shared_options import Record, RecordMap, RecordTlog
+from companion.cli.output import show_table, tell
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.terminal.steps import show_count
@@ -54,54 +53,43 @@ def flight_command(
     with show_count(Console(stderr=True), "pictures") as count:
         found = calibrate(loaded, frames, count)
     wanted = setting_changes(loaded.config, found)
-    console = Console()
-    console.print(_numbers(found))
+    _show_numbers(found)
     blind = blind_spots(found)
-    console.print("What this flight cannot tell:" if blind else "This flight tells all of it.")
+    tell("What this flight cannot tell:" if blind else "This flight tells all of it.")
     for line in blind:
-        console.print(f"  {escape(line)}", soft_wrap=True, highlight=False)
+        tell(f"  {escape(line)}")
     doubt = loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map))
     for note in (*found.notes, *filter(None, (doubt,))):
-        console.print(escape(note), style="yellow", soft_wrap=True)
-    console.print(
+        tell(escape(note), "yellow")
+    tell(
         f"{found.frames} pictures, {found.parts} of their parts: {found.before_px:.2f} px from the "
-        f"map with the deployment's camera, {found.after_px:.2f} px with the one found",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
-    console.print(_changes(wanted))
+        f"map with the deployment's camera, {found.after_px:.2f} px with the one found"
+    )
+    _show_changes(wanted)
     if report is not None:
         text = json.dumps(_figures(found, wanted, blind), indent=1)
         write_result(report, text, "--json")
     if write and config is not None:
         require_flown_with(config, wanted)
         kept = write_changed(config, wanted, f"calibrated by `companion calibrate flight {record}`")
-        console.print(f"{config} is changed; before it: {kept}", style="green", soft_wrap=True)
+        tell(f"{config} is changed; before it: {kept}", "green")
 
 
-def _numbers(found: Any) -> Table:
-    from companion.calibrate.unknowns import UNKNOWNS, USEFUL
+def _show_numbers(found: Any) -> None:
+    from companion.calibrate.unknowns import UNKNOWNS
 
-    table = Table(title="against the deployment", box=SIMPLE_HEAD)
-    for column in ("", "differs by", "1 sigma", "", "told"):
-        table.add_column(column, justify="left" if column in ("", "told") else "right")
-    for unknown, value, sigma, useful in zip(
-        UNKNOWNS, found.shared, found.sigmas, USEFUL, strict=True
-    ):
-        told = "yes" if sigma <= useful else "no"
-        table.add_row(
-            unknown.name, f"{value * unknown.scale:+.3g}", f"{sigma * unknown.scale:.2g}",
-            unknown.unit, told,
-        )  # fmt: skip
-    return table
+    rows = [
+        (n.name, f"{value * n.scale:+.3g}", f"{sigma * n.scale:.2g}", n.unit,
+         "yes" if sigma <= n.useful else "no")
+        for n, value, sigma in zip(UNKNOWNS, found.shared, found.sigmas, strict=True)
+    ]  # fmt: skip
+    headings = ("", "differs by", "1 sigma", "unit", "told")
+    show_table(headings, rows, "against the deployment", headings[1:3])
 
 
-def _changes(wanted: tuple[Any, ...]) -> Table:
-    table = Table(title="deployment", box=SIMPLE_HEAD)
-    for column in ("key", "before", "after"):
-        table.add_column(column, overflow="fold")
-    for change in wanted:
-        table.add_row(".".join(change.key), str(change.before), str(change.after))
-    return table
+def _show_changes(wanted: tuple[Any, ...]) -> None:
+    rows = [(".".join(c.key), str(c.before), str(c.after)) for c in wanted]
+    show_table(("key", "before", "after"), rows, "deployment")
 
 
 def _figures(found: Any, wanted: tuple[Any, ...], blind: tuple[str, ...]) -> dict[str, Any]:
@@ -138,46 +126,41 @@ def board_command(
     """Calibrate a camera from views of a printed board; names the views that are missing."""
     from companion.calibrate.board import write_sheet
 
-    console = Console()
     if sheet is not None:
         made = write_sheet(sheet, paper)
-        console.print(
+        tell(
             f"{sheet}: print it at 100 % on {paper} and glue it on a flat plate; a square is then "
-            f"{made.square_mm:g} mm (another size does no harm)",
-            soft_wrap=True, highlight=False,
-        )  # fmt: skip
+            f"{made.square_mm:g} mm (another size does no harm)"
+        )
     if source is None:
         if sheet is None:
             raise typer.BadParameter("give the stream, or --print a file for the board")
         return
-    _film(console, source, seconds, keep, config)
+    _film(source, seconds, keep, config)
 
 
-def _film(
-    console: Console, source: str, seconds: float, keep: Path | None, config: Path | None
-) -> None:
+def _film(source: str, seconds: float, keep: Path | None, config: Path | None) -> None:
+    from companion.calibrate.board import watch_board
     from companion.calibrate.lens import solve_lens
     from companion.calibrate.proposal import lens_changes, write_changed
-    from companion.calibrate.watching import watch_board
 
     def told(taken: int, word: str, missing: list[str]) -> None:
         wanted = "; ".join(missing[:3]) or "nothing: enough"
-        console.print(f"{taken:2d} views ({word}); missing: {wanted}", highlight=False)
+        tell(f"{taken:2d} views ({word}); missing: {wanted}")
 
     before = load_config(config) if config is not None else None
     filmed = watch_board(source, seconds, told, keep)
     lens = solve_lens(filmed.views, filmed.width, filmed.height)
     c = lens.camera
-    console.print(
+    tell(
         f"{lens.views[0]} of {lens.views[1]} views, {lens.rms_px:.2f} px rms; focal lengths "
         f"{c.fx:.2f}, {c.fy:.2f} px (sigma {lens.sigmas[0]:.2f}), principal point {c.cx:.2f}, "
-        f"{c.cy:.2f} px (sigma {lens.sigmas[2]:.2f})",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
+        f"{c.cy:.2f} px (sigma {lens.sigmas[2]:.2f})"
+    )
     if filmed.missing:
-        console.print(f"not seen: {'; '.join(filmed.missing)}", style="yellow", soft_wrap=True)
+        tell(f"not seen: {'; '.join(filmed.missing)}", "yellow")
     wanted = lens_changes(before, lens)
-    console.print(_changes(wanted))
+    _show_changes(wanted)
     if config is not None:
         kept = write_changed(config, wanted, "lens by `companion calibrate board`")
-        console.print(f"{config} is changed; before it: {kept}", style="green", soft_wrap=True)
+        tell(f"{config} is changed; before it: {kept}", "green")

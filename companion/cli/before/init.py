@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.output import tell
 from companion.config import CompanionConfig, parse_config
 from companion.errors import CompanionError, ConfigError
 from companion.redaction import redacted
@@ -91,12 +92,9 @@ def init_command(
             config = _with_vehicle(config, notes)
     write_deployment(deployment_text(config, notes), out, overwrite)
     for note in notes:
-        Console().print(escape(note), style="yellow", soft_wrap=True, highlight=False)
+        tell(escape(note), "yellow")
     first = "" if config.map_sha256 else "the map, then "
-    Console().print(
-        f"{escape(str(out))} is written; next: {first}companion doctor {escape(str(out))}",
-        soft_wrap=True,
-    )
+    tell(f"{escape(str(out))} is written; next: {first}companion doctor {escape(str(out))}")
 
 
 def _ask(what: str, option: str, default: _Answer | None = None) -> _Answer:
@@ -150,16 +148,15 @@ def _map_hash(map_cache: Path) -> str:
 
 
 def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
-    from companion.redaction import redacted
     from companion.setup.asking import read_stream_size
 
     try:
-        seen = read_stream_size(feed)
+        width, height = read_stream_size(feed)
     except (CompanionError, LocalizerError) as error:
         notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
         return None
-    typer.echo(f"stream: {seen.width}x{seen.height}")
-    return seen.width, seen.height
+    typer.echo(f"stream: {width}x{height}")
+    return width, height
 
 
 def _model(

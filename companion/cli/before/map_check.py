@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
+from companion.cli.output import show_table, tell
 from companion.terminal.steps import show_work
 from companion.writing import make_folder, writing
 
@@ -55,13 +54,11 @@ def check_command(
     with writing(out, "--out"):
         for name, rgb in made.pictures.items():
             write_rgb(out / f"{name}.png", rgb)
-    table = Table(box=SIMPLE_HEAD)
-    for column in ("", "what", "found", "meaning"):
-        table.add_column(column, overflow="fold")
-    for f in made.findings:
-        mark = f"[{_COLOURS[f.grade.value]}]{f.grade.value}[/]"
-        table.add_row(mark, f.name, escape(f.found), escape(f.words))
-    Console().print(table)
+    rows = [
+        (f"[{_COLOURS[f.grade.value]}]{f.grade.value}[/]", f.name, escape(f.found), escape(f.words))
+        for f in made.findings
+    ]
+    show_table(("", "what", "found", "meaning"), rows)
     bad = [f.name for f in made.findings if f.grade.value == "bad"]
     east_m, north_m = made.size_m
     area = f"{east_m:.0f} x {north_m:.0f} m, {max(made.size_m) / _SPEED_M_S:.0f} s of flight"
@@ -70,11 +67,10 @@ def check_command(
         if bad
         else f"This map will do where it is: {area} from end to end at {_SPEED_M_S:.0f} m/s."
     )
-    Console().print(verdict, soft_wrap=True, highlight=False)
+    tell(verdict)
     if made.usable is None:
-        Console().print("No part of it is usable.", highlight=False)
+        tell("No part of it is usable.")
     elif bad or not made.usable.is_whole:
-        Console().print(f"Usable without a gap: {made.usable.line()}; keep what the camera sees "
-                        "inside it.", soft_wrap=True, highlight=False)  # fmt: skip
-    Console().print(f"Pictures: {escape(str(out))}", soft_wrap=True)
+        tell(f"Usable without a gap: {made.usable.line()}; keep what the camera sees inside it.")
+    tell(f"Pictures: {escape(str(out))}")
     raise typer.Exit(0 if made.ok else 1)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.shared_options import numbers
+from companion.cli.output import show_table, tell, tell_warnings
 from companion.errors import ConfigError
 from companion.terminal.steps import READING, show_count, show_work
 from companion.writing import result_file
@@ -100,8 +99,7 @@ def fetch_command(
         if footprints_attribution is not None:
             buildings = replace(buildings, attribution=footprints_attribution)
     known = load_sources(tuple(sources or ()))
-    console = Console()
-    console.print(f"area: {area}", highlight=False, soft_wrap=True)
+    tell(f"area: {area}")
     work = out.with_name(f"{out.name}.fetch")
     chosen = [
         (role, choose(known, area, role, name))
@@ -114,7 +112,7 @@ def fetch_command(
             f"--footprints: {parts[1].source.name} is a surface, which has its buildings; name a "
             "terrain with --heights"
         )
-    total = _print_estimate(console, parts)
+    total = _print_estimate(parts)
     if total > most_mb:
         raise ConfigError(
             f"about {total:.0f} MB, more than --most-mb {most_mb:.0f}: a smaller area, a coarser "
@@ -123,10 +121,10 @@ def fetch_command(
     if only_estimate:
         return
     for part in parts:
-        _fetched(console, part, area)
+        _fetched(part, area)
     if buildings is not None:
-        parts[1] = _raise_buildings(console, parts[1], buildings)
-    _built(console, parts, out, overwrite, workers)
+        parts[1] = _raise_buildings(parts[1], buildings)
+    _built(parts, out, overwrite, workers)
     if not keep:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -143,7 +141,7 @@ def raise_command(
 
     with show_work(Console(stderr=True), "raising buildings"):
         done = raise_buildings(terrain, read_footprints(footprints, height_property), out)
-    Console().print(f"{out}: {done.line()}", markup=False, highlight=False, soft_wrap=True)
+    tell(escape(f"{out}: {done.line()}"))
 
 
 def sources_command(
@@ -153,32 +151,30 @@ def sources_command(
     """List the map services of `map fetch`, licences and attributions."""
     from localizer.map.fetch.catalogue import CatalogueSource, load_sources
 
-    console = Console()
     if keys:
-        table = Table("key", "meaning", box=SIMPLE_HEAD)
-        for name, info in CatalogueSource.model_fields.items():
-            table.add_row(name, escape(info.description or ""))
-        console.print(table)
+        fields = CatalogueSource.model_fields.items()
+        rows = [(name, escape(info.description or "")) for name, info in fields]
+        show_table(("key", "meaning"), rows)
         return
     for source in load_sources(tuple(sources or ())):
-        _print_source(console, source)
+        _print_source(source)
 
 
-def _print_source(console: Console, source: CatalogueSource) -> None:
+def _print_source(source: CatalogueSource) -> None:
     """Print a source. The name comes first and uncut, to be copied; long lines continue below."""
     head = f"{source.name}  ({source.country}, {source.role}, {source.resolution_m:g} m)"
-    console.print(head, style="bold", markup=False, highlight=False, soft_wrap=True)
+    tell(escape(head), "bold")
     for what, text in (
         ("what", source.title), ("licence", source.licence), ("attribution", source.attribution),
     ):  # fmt: skip
-        if console.is_terminal:
+        if (console := Console()).is_terminal:
             line = Table.grid(padding=(0, 1))
             line.add_column(width=16, no_wrap=True)
             line.add_column(overflow="fold")
             line.add_row(f"    {what}:", escape(text))
             console.print(line)
         else:
-            console.print(f"    {what}: {text}", markup=False, highlight=False, soft_wrap=True)
+            tell(escape(f"    {what}: {text}"))
 
 
 def _area(rectangle: str | None, circle: str | None, mission: Path | None, margin: float) -> Area:
@@ -188,32 +184,22 @@ def _area(rectangle: str | None, circle: str | None, mission: Path | None, margi
     if sum(given is not None for given in (rectangle, circle, mission)) != 1:
         raise ConfigError("give one of --rectangle, --circle and --mission")
     if rectangle is not None:
-        return Area(*_numbers("--rectangle", rectangle, 4))
+        return Area(*numbers(rectangle, "--rectangle", ("WEST", "SOUTH", "EAST", "NORTH")))
     if circle is not None:
-        latitude, longitude, radius = _numbers("--circle", circle, 3)
+        latitude, longitude, radius = numbers(circle, "--circle", ("LAT", "LON", "RADIUS"))
         return area_around(np.array([[latitude, longitude]]), radius)
     assert mission is not None
     planned = read_mission(mission)
     places = [(p.latitude_deg, p.longitude_deg) for p in planned.path]
     for unknown in planned.not_judged:
         if unknown.flies:
-            Console(stderr=True).print(
+            tell(
                 f"[yellow]warning:[/] not on a known way: {escape(unknown.text)}; a larger "
                 "--margin may be needed",
-                soft_wrap=True,
+                err=True,
             )
     circles = [abs(p.circle.radius_m) for p in planned.path if p.circle is not None]
     return area_around(np.array(places), margin + max(circles, default=0.0))
-
-
-def _numbers(option: str, text: str, count: int) -> list[float]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count:
-        raise ConfigError(f"{option} {text}: {count} numbers with commas between them")
-    return numbers
 
 
 def _planned(
@@ -228,7 +214,7 @@ def _planned(
     return _Part(source, plan, client, work / f"{role}-pieces", work / f"{role}.tif")
 
 
-def _print_estimate(console: Console, parts: list[_Part]) -> float:
+def _print_estimate(parts: list[_Part]) -> float:
     """Print a line for each source, with what it lacks; returns the megabytes of all."""
     from localizer.map.fetch.fetch import estimate
 
@@ -237,65 +223,53 @@ def _print_estimate(console: Console, parts: list[_Part]) -> float:
         expected = estimate(part.source, part.plan)
         total += expected.bytes / _MB
         width, height = expected.pixels
-        console.print(
+        tell(
             f"{part.source.name}: {part.source.title}; {width} x {height} pixels, about "
             f"{expected.requests} requests, {expected.bytes / _MB:.1f} MB, "
-            f"{expected.seconds:.0f} s at {part.source.rate_per_s:g} requests/s",
-            highlight=False, soft_wrap=True,
-        )  # fmt: skip
-        console.print(f"  licence: {part.source.licence}", highlight=False, soft_wrap=True)
-        for name in part.plan.lacking:
-            console.print(
-                f"[yellow]warning:[/] {part.source.name} has no {escape(name)}: sea, or land that "
-                "it lacks; the map has a hole there",
-                highlight=False, soft_wrap=True,
-            )  # fmt: skip
+            f"{expected.seconds:.0f} s at {part.source.rate_per_s:g} requests/s"
+        )
+        tell(f"  licence: {part.source.licence}")
+        tell_warnings(
+            f"{part.source.name} has no {name}: sea, or land that it lacks; the map has a hole "
+            "there"
+            for name in part.plan.lacking
+        )
     return total
 
 
-def _fetched(console: Console, part: _Part, area: Area) -> None:
+def _fetched(part: _Part, area: Area) -> None:
     from localizer.map.fetch.fetch import fetch
 
-    what = f"fetching {part.source.name}"
-    with _counted_text(what) as progress:
-        known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
-    console.print(
-        f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
-        f"{100 * known:.1f} % of its raster known",
-        highlight=False, soft_wrap=True,
-    )  # fmt: skip
-
-
-@contextmanager
-def _counted_text(what: str) -> Iterator[Callable[[int, int], None]]:
     try:
-        with show_count(Console(stderr=True), what) as progress:
-            yield progress
+        with show_count(Console(stderr=True), f"fetching {part.source.name}") as progress:
+            known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
     except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted: the same command goes on with what has come")
+        tell("interrupted: the same command goes on with what has come", err=True)
         raise
+    tell(
+        f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
+        f"{100 * known:.1f} % of its raster known"
+    )
 
 
-def _raise_buildings(console: Console, part: _Part, footprints: Footprints) -> _Part:
+def _raise_buildings(part: _Part, footprints: Footprints) -> _Part:
     """The terrain with buildings raised on it, as a source with both attributions."""
     from localizer.map.footprints.raise_buildings import raise_buildings
 
     out = part.out.with_name("raised.tif")
     with show_work(Console(stderr=True), "raising buildings"):
         done = raise_buildings(part.out, footprints, out)
-    console.print(f"{footprints.path.name}: {done.line()}", markup=False, highlight=False,
-                  soft_wrap=True)  # fmt: skip
+    tell(escape(f"{footprints.path.name}: {done.line()}"))
     if not footprints.attribution:
-        console.print("[yellow]warning:[/] nobody says whose the footprints are: name them with "
-                      "--footprints-attribution", soft_wrap=True)  # fmt: skip
+        tell_warnings(
+            ("nobody says whose the footprints are: name them with --footprints-attribution",)
+        )
     buildings = footprints.attribution or footprints.path.name
     whose = f"{part.source.attribution}; buildings: {buildings}"
     return replace(part, out=out, source=part.source.model_copy(update={"attribution": whose}))
 
 
-def _built(
-    console: Console, parts: list[_Part], out: Path, overwrite: bool, workers: int | None
-) -> None:
+def _built(parts: list[_Part], out: Path, overwrite: bool, workers: int | None) -> None:
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
     from localizer.map.cache.cache import TileCache
@@ -315,17 +289,15 @@ def _built(
     )
     with show_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
         manifest = build_cache([parts[1].out, parts[0].out], out, options, progress=bar)
-    for text in manifest.warnings:
-        console.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
+    tell_warnings(manifest.warnings)
     with show_work(Console(stderr=True), "verifying the cache"):
         found = verify(TileCache.open(out))
     for line in found.damaged:
-        console.print(f"[red]{escape(line)}")
+        tell(f"[red]{escape(line)}")
     if found.damaged:
         raise typer.Exit(1)
-    console.print(
+    tell(
         f"[green]{escape(str(out))}[/]: {manifest.tiles} tiles, all intact, "
         f"{found.covered_m2 / 1e6:.2f} km² covered, {len(found.holes)} holes, "
-        f"{manifest.gsd_m:.2f} m texels; © {escape(str(options.attribution))}",
-        soft_wrap=True,
+        f"{manifest.gsd_m:.2f} m texels; © {escape(str(options.attribution))}"
     )

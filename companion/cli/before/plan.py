@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
+from companion.cli.output import show_table, tell
 from companion.config import load_config
 from companion.terminal.steps import show_count, show_work
 from companion.writing import make_folder, write_result, writing
@@ -97,21 +96,17 @@ def plan_command(
     _print("alternatives", page.PROPOSAL_HEADINGS, page.proposal_rows(plan))
     if legs:
         _print("flown", check.FLOWN_HEADINGS, [leg.row for leg in legs])
-        Console().print(check.flown_words(legs), highlight=False, soft_wrap=True)
+        tell(check.flown_words(legs))
     for note in plan.notes:
-        Console().print(escape(note), style="dim", soft_wrap=True, highlight=False)
-    Console().print(f"{escape(page.verdict_words(plan))} {escape(str(out / 'plan.html'))}",
-                    style="green" if plan.holds else "red", soft_wrap=True)  # fmt: skip
+        tell(escape(note), "dim")
+    tell(
+        f"{escape(page.verdict_words(plan))} {escape(str(out / 'plan.html'))}",
+        "green" if plan.holds else "red",
+    )
     raise typer.Exit(0 if plan.holds else 1)
 
 
 def _print(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    made = list(rows)
-    if not made:
-        return
-    table = Table(title=title, box=SIMPLE_HEAD)
-    for heading in headings:
-        table.add_column(heading, overflow="fold")
-    for row in made:
-        table.add_row(*map(escape, row))
-    Console().print(table)
+    made = [tuple(map(escape, row)) for row in rows]
+    if made:
+        show_table(headings, made, title)

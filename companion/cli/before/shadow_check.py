@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from companion.cli.before.shared_options import FieldOfView, FootageCamera, MountPitch
+from companion.cli.output import show_table, tell, tell_notes
 from companion.terminal.steps import COMPILES, show_count
 from companion.writing import result_file, write_result
 
@@ -107,15 +107,11 @@ def _deployment(flight: RecordedFlight, map_cache: Path) -> CompanionConfig:
 
 
 def _show(found: ShadowCheck) -> None:
-    for note in found.notes:
-        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
-    out = Console()
-    table = Table("at, s", "the operator would have read")
-    for line in found.lines:
-        if line.severity <= _WARNING:
-            table.add_row(f"{line.at_s:.0f}", escape(line.text))
-    if table.row_count:
-        out.print(table)
+    tell_notes(found.notes)
+    lines = [line for line in found.lines if line.severity <= _WARNING]
+    if lines:
+        rows = [(f"{line.at_s:.0f}", escape(line.text)) for line in lines]
+        show_table(("at, s", "the operator would have read"), rows)
     held = ", ".join(f"{name} {s:.0f} s" for name, s in found.held_s.items()) or "never"
     begun = "never" if found.first_go_s is None else f"from {found.first_go_s:.0f} s on"
     for text in (
@@ -124,6 +120,6 @@ def _show(found: ShadowCheck) -> None:
         f"output held: {held}",
         f"the shadow score was a go for {found.go_s:.0f} s, {begun}",
     ):
-        out.print(text, soft_wrap=True, highlight=False)
+        tell(text)
     style = "bold green" if found.go else "bold red"
-    out.print(f"shadow verdict: {escape(found.score.line())}", style=style, soft_wrap=True)
+    tell(f"shadow verdict: {escape(found.score.line())}", style)

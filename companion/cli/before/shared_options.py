@@ -1,12 +1,15 @@
-"""Options that several commands have."""
+"""Options that several commands have, and the parser of those with several numbers."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from companion.errors import ConfigError
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
 
@@ -31,3 +34,16 @@ FeatureNetwork = Annotated[Path | None, typer.Option(help="ONNX feature network"
 Record = Annotated[Path, typer.Argument(help="folder that `companion run` recorded")]
 RecordTlog = Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")]
 RecordMap = Annotated[Path | None, typer.Option("--map", help="instead of the record's map")]
+
+
+def numbers(text: str, option: str, names: Sequence[str]) -> tuple[float, ...]:
+    """Parse the text of an option, as 47.1,8.5,500; `names`: meanings of the numbers, one each.
+    `ConfigError` for another count, or what is no finite number.
+    """
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != len(names) or not all(map(math.isfinite, values)):
+        raise ConfigError(f"{option} is {','.join(names)}, {len(names)} numbers, not {text!r}")
+    return values

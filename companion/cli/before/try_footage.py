@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.text import Text
 
 from companion.cli.before.shared_options import FieldOfView, FootageCamera, MountPitch, WorkingWidth
+from companion.cli.output import tell, tell_notes
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, show_count, show_steps
 from companion.writing import make_folder, refuse_input
@@ -71,29 +73,22 @@ def try_command(
 def _print_map(flight: RecordedFlight) -> None:
     from companion.trial.wanted_map import flat_map_advice, wanted_map
 
-    _print_notes(flight, flight.notes)
+    tell_notes((f"camera by {flight.camera.source}", *flight.notes))
     wanted = wanted_map(flight)
-    out = Console()
-    out.print(
+    tell(
         f"{len(flight.frames)} frames, {flight.located_count} with a position; no map is given. "
-        f"{wanted.sentence}.",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
+        f"{wanted.sentence}."
+    )
     for line in (f"Where open data exist: {wanted.command('area')}", flat_map_advice(flight)):
         if line:
-            out.print(line, soft_wrap=True, highlight=False)
-
-
-def _print_notes(flight: RecordedFlight, notes: tuple[str, ...]) -> None:
-    for note in (f"camera by {flight.camera.source}", *notes):
-        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
+            tell(line)
 
 
 def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, searches: int) -> None:
     from companion.trial.deployment import write_trial_deployment
     from companion.trial.page import write_trial
     from companion.trial.result import trial_verdict
-    from companion.trial.run import TrialOptions, run_trial
+    from companion.trial.run import run_trial
     from localizer.map.cache.cache import TileCache
 
     TileCache.open(map_cache)  # what is missing is said before anything is computed
@@ -102,14 +97,13 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
     def stage(what: str) -> AbstractContextManager[Callable[..., None]]:
         return show_count(console, what, begins=COMPILES if what == "localizing" else "begun")
 
-    trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
+    trial = run_trial(flight, map_cache, width, searches, stage)
     judgement = trial_verdict(trial)
-    _print_notes(flight, trial.notes)
+    tell_notes((f"camera by {flight.camera.source}", *trial.notes))
     with show_steps(console) as say:
         page = write_trial(report, trial, judgement, map_cache, say)
     deployment = write_trial_deployment(report / "deployment.yaml", trial, map_cache)
-    out = Console()
-    out.print(judgement.sentence, style="bold", soft_wrap=True, highlight=False)
-    out.print("deployment file:", str(deployment), soft_wrap=True, highlight=False)
-    out.print("report:", file_link(page), soft_wrap=True, highlight=False)
+    tell(judgement.sentence, "bold")
+    tell(f"deployment file: {escape(str(deployment))}")
+    tell(Text.assemble("report: ", file_link(page)))
     raise typer.Exit(judgement.exit_code)

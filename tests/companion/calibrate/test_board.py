@@ -11,10 +11,9 @@ import yaml
 from PIL import Image as PillowImage
 from typer.testing import CliRunner
 
-from companion.calibrate.board import ACROSS, DOWN, board_picture, write_sheet
+from companion.calibrate.board import ACROSS, DOWN, BoardViews, board_picture, write_sheet
 from companion.calibrate.lens import solve_lens
 from companion.calibrate.pictures import PictureReader
-from companion.calibrate.views import BoardViews
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.errors import RecordError, ReportError

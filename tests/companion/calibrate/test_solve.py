@@ -11,8 +11,13 @@ import yaml
 from numpy.typing import NDArray
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
-from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
+from companion.calibrate.evidence import (
+    OFFSETS_S,
+    AutopilotWindow,
+    CalibrationFrame,
+    CalibrationProblem,
+    changed_camera,
+)
 from companion.calibrate.flight import CalibrationResult, receiver_bias_m
 from companion.calibrate.pictures import Parts
 from companion.calibrate.proposal import (
@@ -23,8 +28,7 @@ from companion.calibrate.proposal import (
     setting_changes,
     write_changed,
 )
-from companion.calibrate.solve import solve
-from companion.calibrate.spatial_correlation import ImageNormalEquations, images_covariance
+from companion.calibrate.solve import ImageNormalEquations, images_covariance, solve
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.geometry import GIMBAL_FROM_CAMERA

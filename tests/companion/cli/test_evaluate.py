@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.errors import ReportError
-from localizer.errors import CameraError, OutsideMapError, SequenceError
+from localizer.errors import OutsideMapError, SequenceError
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario
 from sitl.rehearsal.rehearse import rehearse
@@ -128,16 +128,6 @@ def test_images_that_cannot_be_used_are_named_and_counted_and_the_rest_is_locali
     assert [r["accepted"] for r in rows] == ["", "1", "1", "", "1", "1"]
     with pytest.raises(SequenceError, match=r"000000\.jpg"):
         _run(*arguments, "--limit", 1)
-
-
-def test_a_wrong_camera_file_is_named(recorded, tmp_path):
-    assets, sequence = recorded
-    broken = tmp_path / "broken"
-    shutil.copytree(sequence, broken)
-    camera = json.loads((broken / "camera.json").read_text())
-    (broken / "camera.json").write_text(json.dumps(camera | {"fx": -1}))
-    with pytest.raises(CameraError, match=r"camera\.json: focal lengths"):
-        _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_work(recorded, tmp_path):

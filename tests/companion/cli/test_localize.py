@@ -78,37 +78,24 @@ def test_a_folder_goes_on_from_its_first_prior_and_tells_what_it_could_not_use(
 ):
     folder = tmp_path / "images"
     folder.mkdir()
-    for name in ("000000.jpg", "000001.jpg", "000002.jpg", "timestamps.txt"):
+    for name in ("000000.jpg", "000001.jpg", "000002.jpg", "000003.jpg", "timestamps.txt"):
         shutil.copy(small_sequence / "images" / name, folder)
     (folder / "000001.jpg").write_bytes(b"no image")
+    for name, counts in (("000002.jpg", 1), ("000003.jpg", 9)):  # thermal cameras
+        grey = np.asarray(cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE), np.uint16) * counts
+        kept = grey if counts > 1 else grey.astype(np.uint8)
+        (folder / name).write_bytes(cv2.imencode(".png", kept)[1].tobytes())
     row = read_poses(small_sequence / "poses.txt")[0]
     out = tmp_path / "out"
     result = _run(folder, *_common(small_assets, small_sequence, out), "--prior", _off(row, 3))
     assert result.exit_code == 0, result.output
     assert "000001.jpg: not an image" in result.output
-    assert "2 of 3 images localized" in result.output
+    assert "000003.jpg: 16-bit grey" in result.output
+    assert "2 of 4 images localized" in result.output
     assert max(metres for metres, _ in _errors(small_assets, small_sequence, out)) < 1.0
     with (out / "images.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["accepted"] for row in rows] == ["1", "", "1"]
-
-
-def test_grey_pictures_are_localized_and_counts_told(small_assets, small_sequence, tmp_path):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    shutil.copy(small_sequence / "images/timestamps.txt", folder)
-    for name in ("000000.jpg", "000001.jpg"):
-        grey = cv2.imread(str(small_sequence / "images" / name), cv2.IMREAD_GRAYSCALE)
-        kept = grey if name == "000000.jpg" else grey.astype(np.uint16) * 9
-        _, coded = cv2.imencode(".png", kept)
-        (folder / name).write_bytes(coded.tobytes())  # a PNG whatever its name
-    row = read_poses(small_sequence / "poses.txt")[0]
-    out = tmp_path / "out"
-    result = _run(folder, *_common(small_assets, small_sequence, out), "--prior", _off(row, 3))
-    assert "1 of 2 images localized" in result.output
-    assert "000001.jpg: 16-bit grey" in result.output
-    with (out / "images.csv").open(newline="") as file:
-        assert [row["accepted"] for row in csv.DictReader(file)] == ["1", ""]
+    assert [row["accepted"] for row in rows] == ["1", "", "1", ""]
 
 
 def test_a_place_where_it_was_not_taken_is_no_place(small_assets, small_sequence, tmp_path):

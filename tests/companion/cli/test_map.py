@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from xml.etree import ElementTree
 
@@ -113,20 +112,13 @@ def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
 @pytest.mark.parametrize("what", ["render", "export"])
 @pytest.mark.parametrize(
     ("place", "why"),
-    [("folder.png", "is a folder"), ("none/v.png", "no such folder"),
-     ("v.png", "may not be written"), ("v.png", "cannot be written: No space left")],
-)  # fmt: skip
+    [("none/v.png", "no such folder"), ("v.png", "cannot be written: No space left")],
+)
 def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch, what, place, why):
-    for suffix in ("png", "glb"):
-        (tmp_path / f"folder.{suffix}").mkdir()
-
     def full(_path, _data):
         raise OSError(28, "No space left on device")
 
-    if "may not" in why:  # root, as whom tests may run, is refused nothing
-        monkeypatch.setattr("os.access", lambda _path, mode: mode != os.W_OK)
-    elif "No space" in why:
-        monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
     pose = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500, "--width", 64]
     place = (tmp_path / place).with_suffix(".png" if what == "render" else ".glb")
     result = run(what, cache.path, *(pose if what == "render" else ()), "--out", place)

@@ -4,12 +4,10 @@ import csv
 
 import numpy as np
 import pytest
-from PIL import Image
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.convert.angles import (
-    Angles,
     AutopilotAngles,
     angles_of_matrix,
     gimbal_of_pose,
@@ -23,11 +21,11 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
 from localizer.geometry.posefile import (
     PoseRow,
-    pose_row,
     read_poses,
     world_from_camera,
     write_poses,
 )
+from tests.companion.recorded.photos import dji, write_photo
 
 ORIGIN = Geodetic(47.3, 8.5, 450.0)
 FRAME = LocalFrame(ORIGIN)
@@ -118,29 +116,14 @@ def test_a_geoid_separation_that_is_none_is_refused(poses, tmp_path, separation,
     assert not (tmp_path / "x").exists()
 
 
-def _photo(path, xmp, *, below=False):
-    """A JPEG with EXIF's GPS position and an XMP segment, made by hand."""
-    exif = Image.Exif()
-    exif[0x8825] = {1: "S", 2: (12.0, 30.0, 36.0), 3: "W", 4: (77.0, 0.0, 18.0),
-                    5: b"\x01" if below else b"\x00", 6: 154.0}  # fmt: skip
-    Image.new("RGB", (16, 12)).save(path, exif=exif)
-    data = path.read_bytes()
-    payload = b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode()
-    segment = b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
-    path.write_bytes(data[:2] + segment + data[2:])
-
-
-DJI = (
-    '<x:xmpmeta><rdf:Description drone-dji:GimbalRollDegree="+0.00" '
-    'drone-dji:GimbalYawDegree="+90.00"{more}>'
-    "<drone-dji:GimbalPitchDegree>-60.00</drone-dji:GimbalPitchDegree>"
-    "</rdf:Description></x:xmpmeta>"
-)
+_LOOKS_EAST = {"GimbalRollDegree": "+0.00", "GimbalPitchDegree": "-60.00",
+               "GimbalYawDegree": "+90.00"}  # fmt: skip
 
 
 def test_a_photos_own_tags(tmp_path):
     """East, 60 degrees down: the camera's axes by hand, the position from EXIF."""
-    _photo(tmp_path / "DJI_0001.JPG", DJI.format(more=""))
+    at = (-12.51, -77.005, 154.0)
+    write_photo(tmp_path / "DJI_0001.JPG", dji(**_LOOKS_EAST), place=at)
     out = tmp_path / "poses.txt"
     options = ("--from", "photos", "--to", "poses", "--heights", "amsl", "--geoid-separation", 20,
                "--origin", "-12.51,-77.005,170")  # fmt: skip
@@ -156,8 +139,8 @@ def test_a_photos_own_tags(tmp_path):
     assert R[:, 0] == pytest.approx([0, -1, 0], abs=1e-6)  # right is south
     assert (row.roll_deg, row.pitch_deg, row.yaw_deg) == pytest.approx((0, 30, -90), abs=1e-5)
     # XMP's own position, more digits, wins.
-    more = ' drone-dji:GpsLatitude="-12.5" drone-dji:GpsLongtitude="-77.0" '
-    _photo(tmp_path / "DJI_0001.JPG", DJI.format(more=more + 'drone-dji:AbsoluteAltitude="+9.5"'))
+    own = dji(**_LOOKS_EAST, GpsLatitude="-12.5", GpsLongtitude="-77.0", AbsoluteAltitude="+9.5")
+    write_photo(tmp_path / "DJI_0001.JPG", own, place=at)
     _convert(tmp_path, out, *options)
     (row,) = read_poses(out)
     assert row.position.latitude_deg == pytest.approx(-12.5)
@@ -166,39 +149,34 @@ def test_a_photos_own_tags(tmp_path):
 
 def test_a_photo_without_angles_is_named(tmp_path):
     options = ("--from", "photos", "--to", "poses", "--heights", "ellipsoidal", *PLACE)
-    Image.new("RGB", (16, 12)).save(tmp_path / "plain.jpg")
+    write_photo(tmp_path / "plain.jpg")
     with pytest.raises(PoseFileError, match=r"plain\.jpg: no gimbal angles"):
         _convert(tmp_path, tmp_path / "o", *options)
-    _photo(tmp_path / "plain.jpg", '<x:xmpmeta drone-dji:GimbalYawDegree="1"></x:xmpmeta>')
+    write_photo(tmp_path / "plain.jpg", dji(GimbalYawDegree="1"))
     with pytest.raises(PoseFileError, match=r"plain\.jpg: no gimbal angles"):
         _convert(tmp_path, tmp_path / "o", *options)
 
 
 PHOTOS = ("--from", "photos", "--to", "poses", "--heights", "ellipsoidal", *PLACE)
-PLACED = (
-    '<x:xmpmeta><rdf:Description drone-dji:GpsLatitude="47.2" drone-dji:GpsLongitude="{longitude}" '
-    'drone-dji:AbsoluteAltitude="{height:+.2f}" drone-dji:GimbalRollDegree="+0.00" '
-    'drone-dji:GimbalYawDegree="{yaw:+.2f}" drone-dji:GimbalPitchDegree="{pitch:+.2f}" {more}/>'
-    "</x:xmpmeta>"
-)
 
 
-def _placed(path, *, yaw=12.0, pitch=-89.9, height=520.0, longitude=8.2, more=""):
-    _photo(path, PLACED.format(yaw=yaw, pitch=pitch, height=height, longitude=longitude, more=more))
+def _placed(*, yaw=12.0, pitch=-89.9, height=520.0, longitude=8.2, **more):
+    return dji(GpsLatitude="47.2", GpsLongitude=longitude, AbsoluteAltitude=f"{height:+.2f}",
+               GimbalRollDegree="+0.00", GimbalYawDegree=f"{yaw:+.2f}",
+               GimbalPitchDegree=f"{pitch:+.2f}", **more)  # fmt: skip
 
 
 def test_angles_that_were_not_measured_are_named(tmp_path):
     """Mini 2, and P1 on the M400, write 0.00 while the camera looks down."""
     for k in range(3):
-        _placed(tmp_path / f"DJI_{k}.JPG", yaw=0.0 if k else 12.0, pitch=0.0 if k else -89.9)
+        xmp = _placed(yaw=0.0, pitch=0.0) if k else _placed()
+        write_photo(tmp_path / f"DJI_{k}.JPG", xmp)
     with pytest.raises(
         PoseFileError, match=r"all 0 in 2 of 3 photos, first DJI_1\.JPG: .*not meas"
     ):
         _convert(tmp_path, tmp_path / "o", *PHOTOS)
     for k in (1, 2):  # the user says where it looked
-        (tmp_path / f"DJI_{k}.xmp").write_text(
-            PLACED.format(yaw=12, pitch=-90, height=520, longitude=8.2, more="")
-        )
+        (tmp_path / f"DJI_{k}.xmp").write_text(_placed(pitch=-90))
     _convert(tmp_path, tmp_path / "o", *PHOTOS)
     assert [row.pitch_deg for row in read_poses(tmp_path / "o")] == pytest.approx([0.1, 0, 0])
 
@@ -206,15 +184,15 @@ def test_angles_that_were_not_measured_are_named(tmp_path):
 @pytest.mark.parametrize(
     "kinds",
     [
-        ('drone-dji:AltitudeType="RtkAlt" drone-dji:RtkFlag="50"',
-         'drone-dji:AltitudeType="GpsFusionAlt" drone-dji:RtkFlag="0"'),
-        ('drone-dji:RtkFlag="50"', 'drone-dji:RtkFlag="0"'),
-        ('drone-dji:RtkFlag="50"', ""),
+        ({"AltitudeType": "RtkAlt", "RtkFlag": 50}, {"AltitudeType": "GpsFusionAlt", "RtkFlag": 0}),
+        ({"RtkFlag": 50}, {"RtkFlag": 0}),
+        ({"RtkFlag": 50}, {}),
     ],
-)  # fmt: skip
+)
 def test_heights_above_two_surfaces_in_one_flight_are_named(tmp_path, kinds):
     for k in range(4):
-        _placed(tmp_path / f"DJI_{k}.JPG", height=(567.5, 519.8)[k // 2], more=kinds[k // 2])
+        xmp = _placed(height=(567.5, 519.8)[k // 2], **kinds[k // 2])
+        write_photo(tmp_path / f"DJI_{k}.JPG", xmp, place=(47.2, 8.2, 154.0))
     with pytest.raises(PoseFileError, match=r"different surfaces .*2 photos, first DJI_2\.JPG"):
         _convert(tmp_path, tmp_path / "o", *PHOTOS)
 
@@ -222,9 +200,9 @@ def test_heights_above_two_surfaces_in_one_flight_are_named(tmp_path, kinds):
 def test_what_is_odd_about_a_flights_tags_is_told(tmp_path):
     flags = (50, 34, 50)
     for k, (height, above) in enumerate(((520, 80), (521, 81), (569, 81))):
-        more = f'drone-dji:RtkFlag="{flags[k]}" drone-dji:RelativeAltitude="{above:+}"'
-        more += ' drone-dji:AltitudeType="GpsFusionAlt"'
-        _placed(tmp_path / f"DJI_{k}.JPG", height=height, more=more)
+        xmp = _placed(height=height, RtkFlag=flags[k], RelativeAltitude=f"{above:+}",
+                      AltitudeType="GpsFusionAlt")  # fmt: skip
+        write_photo(tmp_path / f"DJI_{k}.JPG", xmp)
     told = _convert(tmp_path, tmp_path / "o", *PHOTOS).output
     assert "RtkFlag 34, 50: not all photos have an RTK fix" in told
     assert "AltitudeType GpsFusionAlt: such heights are amsl, not ellipsoidal" in told
@@ -233,25 +211,15 @@ def test_what_is_odd_about_a_flights_tags_is_told(tmp_path):
 
 
 def test_a_photo_without_a_fix_is_named(tmp_path):
-    xmp = PLACED.format(longitude=0.0, height=0.0, yaw=1, pitch=-90, more="").replace("47.2", "0.0")
-    _photo(tmp_path / "DJI_0.JPG", xmp)
+    xmp = _placed(longitude="0.0", height=0.0).replace("47.2", "0.0")
+    write_photo(tmp_path / "DJI_0.JPG", xmp)
     with pytest.raises(PoseFileError, match=r"DJI_0\.JPG: .*no GNSS fix"):
         _convert(tmp_path, tmp_path / "o", *PHOTOS)
 
 
-def test_photos_of_another_maker_are_read_as_try_reads_them(tmp_path):
-    """Pix4D's Camera tags: pitch 0 looks down."""
-    xmp = '<x:xmpmeta Camera:Pitch="30" Camera:Roll="0" Camera:Yaw="90"></x:xmpmeta>'
-    _photo(tmp_path / "A.JPG", xmp)
-    _convert(tmp_path, tmp_path / "o", *PHOTOS)
-    (row,) = read_poses(tmp_path / "o")
-    R = world_from_camera(row, LocalFrame(row.position)).rotation
-    assert R[:, 2] == pytest.approx([0.5, 0, -np.sqrt(0.75)], abs=1e-6)
-
-
 @pytest.mark.parametrize("name", ["a.jpg", "b.JPG", "a.xmp", "c.mp4", "d.DNG"])
 def test_no_result_replaces_footage(tmp_path, name):
-    _placed(tmp_path / "a.jpg")
+    write_photo(tmp_path / "a.jpg", _placed())
     before = (tmp_path / "a.jpg").read_bytes()
     with pytest.raises(ConfigError, match="footage file's name"):
         _convert(tmp_path, tmp_path / name, *PHOTOS)
@@ -259,18 +227,11 @@ def test_no_result_replaces_footage(tmp_path, name):
 
 
 def test_no_sidecar_replaces_the_one_that_is_read(tmp_path):
-    _placed(tmp_path / "a.jpg")
+    write_photo(tmp_path / "a.jpg", _placed())
     for source in (tmp_path, tmp_path / "a.jpg"):
         with pytest.raises(ReportError, match="would replace"):
             _convert(source, tmp_path, "--from", "photos", "--to", "photos",
                      "--heights", "ellipsoidal", *PLACE)  # fmt: skip
-
-
-def test_what_a_mac_leaves_beside_photos_is_none(tmp_path):
-    _placed(tmp_path / "DJI_0.JPG")
-    (tmp_path / "._DJI_0.JPG").write_bytes(bytes(4096))
-    _convert(tmp_path, tmp_path / "o", *PHOTOS)
-    assert len(read_poses(tmp_path / "o")) == 1
 
 
 @pytest.mark.parametrize("gimbal_frame", ["heading", "earth", "body"])
@@ -369,11 +330,10 @@ def test_what_is_no_pose_is_named_with_its_file(tmp_path, of, text):
 def test_a_gimbal_straight_down_keeps_its_heading():
     for yaw in (-170.0, 0.0, 33.0, 179.0):
         angles = angles_of_matrix(matrix_from_euler(0.0, -np.pi / 2, np.radians(yaw)))
-        assert (angles.roll_deg, angles.pitch_deg) == (0.0, -90.0)
-        assert angles.yaw_deg == pytest.approx(yaw)
-        level, down = Angles(0.0, 0.0, 0.0), Angles(0.0, -90.0, yaw)
+        assert angles == pytest.approx((0.0, -90.0, yaw))
+        level, down = (0.0, 0.0, 0.0), (0.0, -90.0, yaw)
         pose = pose_of_autopilot(AutopilotAngles("", None, ORIGIN, level, down), FRAME)
-        assert gimbal_of_pose(pose, FRAME).yaw_deg == pytest.approx(yaw)
+        assert gimbal_of_pose(pose, FRAME)[2] == pytest.approx(yaw)
 
 
 def test_a_map_or_an_origin_is_needed(poses, tmp_path):
@@ -382,21 +342,3 @@ def test_a_map_or_an_origin_is_needed(poses, tmp_path):
     with pytest.raises(ConfigError, match="either --map or --origin"):
         _convert(poses, tmp_path / "x", "--from", "poses", "--to", "colmap", "--map", tmp_path,
                  *PLACE)  # fmt: skip
-
-
-# --- The tables of angles.md say what the conversions say ---------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("gimbal", "row"),
-    [
-        ((0, -40, 60), (0, 50, -60)),  # the figure's
-        ((0, -90, 0), (0, 0, 0)),  # straight down, the picture's top to the north
-        ((0, 0, -90), (0, 90, 90)),  # level, to the west
-    ],
-)
-def test_the_tables_zeros_and_signs(gimbal, row):
-    place = Geodetic(47.3, 8.5, 500.0)
-    level = AutopilotAngles("", None, place, Angles(0.0, 0.0, 0.0), Angles(*gimbal))
-    found = pose_row("", pose_of_autopilot(level, LocalFrame(place)), LocalFrame(place))
-    assert (found.roll_deg, found.pitch_deg, found.yaw_deg) == pytest.approx(row, abs=1e-9)

@@ -78,9 +78,12 @@ def test_half_a_log_and_no_log_are_named(tmp_path):
     half = tmp_path / "half.tlog"
     half.write_bytes(whole[: len(whole) // 2 + 3])
     assert len(read_autopilot_log(half).track) > 20
-    for name, content in (("a.tlog", b""), ("b.bin", b"no log at all"), ("c.tlog", whole[:60])):
+    for name, content, why in (
+        ("a.tlog", b"", ""), ("b.bin", b"no log at all", ""), ("c.tlog", whole[:60], ""),
+        ("d.tlog", whole + bytes(20), "damaged"),
+    ):  # fmt: skip
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(FootageError, match=name):
+        with pytest.raises(FootageError, match=f"{name}: .*{why}"):
             read_autopilot_log(tmp_path / name)
 
 
@@ -182,9 +185,9 @@ def _other(t):
 
 
 @pytest.mark.parametrize(
-    ("motion", "flown"), [(_level, _level), (_round, _round), (swaying, _other)]
+    ("motion", "flown", "count"),
+    [(_level, _level, 4), (_round, _round, 10), (swaying, _other, 4), (swaying, _other, 10)],
 )
-@pytest.mark.parametrize("count", [4, 10])
 def test_an_offset_that_others_match_or_chance_is_not_decisive(tmp_path, motion, flown, count):
     """Straight and level, on equal rounds, or in another flight's log: an offset was found by
     chance where three pairs of images left 2 degrees.

@@ -74,7 +74,7 @@ def test_counts_in_files_need_their_range(tmp_path: Path, name: str) -> None:
     assert _is_grey(frame.image, np.where(COUNTS <= 8000, 0, 255))
     with pytest.raises(SequenceError, match=rf"{name}: 16-bit grey.*write it with 8 bits"):
         _sequence(tmp_path / name).frame(0)
-    assert read_stream_size(str(tmp_path)).width == 64  # `companion init` asks for the size alone
+    assert read_stream_size(str(tmp_path))[0] == 64  # `companion init` asks for the size alone
 
 
 def _sequence(path: Path) -> Sequence:
@@ -104,7 +104,7 @@ def test_counts_in_a_video_need_their_range(tmp_path: Path) -> None:
     assert source.state is StreamState.FAILED
     for frame in open_source(path, CAMERA, SourceSettings(grey_range=RANGE)).frames():
         assert _is_grey(frame.image, GREY)
-    assert read_stream_size(str(path)).height == 48
+    assert read_stream_size(str(path))[1] == 48
 
 
 def test_live_counts_need_their_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +122,7 @@ def test_live_counts_need_their_range(tmp_path: Path, monkeypatch: pytest.Monkey
     source = open_source("rtsp://127.0.0.1:1/", CAMERA, SourceSettings(grey_range=RANGE))
     assert _is_grey(next(source.frames()).image, GREY)
     source.close()
-    assert read_stream_size("rtsp://127.0.0.1:1/").height == 48  # 4:3, and 16:9 was guessed
+    assert read_stream_size("rtsp://127.0.0.1:1/")[1] == 48  # 4:3, and 16:9 was guessed
 
 
 @pytest.mark.parametrize("wrong", [(9000, 7000), (5, 5), (-1, 9), (0, 65536), (1,)])

@@ -21,6 +21,7 @@ CELL = 0.25  # metres of the ground's texture
 SIZE = 1200
 CAMERA = Camera(240, 180, 200.0, 200.0, 120.0, 90.0)
 ROOF = (10.0, 8.0)  # half side and height, about the origin
+AWAY = ((500.0, 500.0), 0.0)
 
 
 def texture(seed, size):
@@ -42,19 +43,29 @@ class Pictures:
         self._rays = CAMERA.rays(np.stack([u, v], axis=-1))
 
     def of(self, pose, time_s):
-        d = self._rays @ pose.rotation.T
-        eye = pose.translation
-        ground = eye + d * (-eye[2] / d[..., 2])[..., None]
-        image = self._sample(GROUND, ground[..., :2], CELL)
-        (x, y), course = self._car_at(time_s)
-        c, s = np.cos(course), np.sin(course)
-        off = ground[..., :2] - (x, y)
-        along = np.stack([c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]], -1)
+        ground, roof = self._level(pose, 0.0), self._level(pose, ROOF[1])
+        image = self._sample(GROUND, ground, CELL)
+        along = self._along_car(ground, time_s)
         inside = (np.abs(along) < (2.5, 1.2)).all(axis=-1)
         image[inside] = self._sample(CAR, along, CELL)[inside]
-        roof = eye + d * ((ROOF[1] - eye[2]) / d[..., 2])[..., None]
-        covered = (np.abs(roof[..., :2]) < ROOF[0]).all(axis=-1)
-        image[covered] = self._sample(TILES, roof[..., :2], CELL)[covered]
+        covered = (np.abs(roof) < ROOF[0]).all(axis=-1)
+        image[covered] = self._sample(TILES, roof, CELL)[covered]
+        return self._noisy(image, time_s)
+
+    def _level(self, pose, height_m):
+        """Where each pixel's ray meets a height."""
+        d = self._rays @ pose.rotation.T
+        at = pose.translation + d * ((height_m - pose.translation[2]) / d[..., 2])[..., None]
+        return at[..., :2]
+
+    def _along_car(self, ground, time_s):
+        """Points of the ground along and across the car, from its middle."""
+        place, course = self._car_at(time_s)
+        c, s = np.cos(course), np.sin(course)
+        return (ground - place) @ np.array([[c, -s], [s, c]])
+
+    @staticmethod
+    def _noisy(image, time_s):
         noise = np.roll(NOISE, round(time_s * 10) * 7, axis=1)
         return np.clip(image + noise, 0, 255).astype(np.uint8)
 
@@ -64,25 +75,24 @@ class Pictures:
         return cv2.remap(picture, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
 
-def watching(time_s):
-    """Circles at 90 m, and keeps the middle in view."""
-    angle = 0.05 * time_s
-    eye = np.array([25.0 * np.cos(angle), 25.0 * np.sin(angle) - 10.0, 90.0])
-    z = np.array([0.0, -5.0, 0.0]) - eye
+def looking(eye, at):
+    z = np.array(at) - eye
     z /= np.linalg.norm(z)
     x = np.cross(z, [0.0, 1.0, 0.0])
     x /= np.linalg.norm(x)
-    return Pose(np.column_stack([x, np.cross(z, x), z]), eye)
+    return Pose(np.column_stack([x, np.cross(z, x), z]), np.array(eye))
+
+
+def watching(time_s):
+    """Circles at 90 m, and keeps the middle in view."""
+    angle = 0.05 * time_s
+    eye = (25.0 * np.cos(angle), 25.0 * np.sin(angle) - 10.0, 90.0)
+    return looking(eye, (0.0, -5.0, 0.0))
 
 
 def close_by(time_s):
     """Half as high, a car's length off the crossing."""
-    eye = np.array([-14.0 + 2.0 * time_s, -24.0, 45.0])
-    z = np.array([-14.0, -16.0, 0.0]) - eye
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    return Pose(np.column_stack([x, np.cross(z, x), z]), eye)
+    return looking((-14.0 + 2.0 * time_s, -24.0, 45.0), (-14.0, -16.0, 0.0))
 
 
 def driving(time_s):
@@ -96,10 +106,10 @@ def driving(time_s):
 class Watcher(Operator):
     """An operator with pictures; poses err by a little, as a registration's do."""
 
-    def __init__(self, pictures, until_s, flown=watching, sigma_m=0.05):
+    def __init__(self, pictures, flown=watching, sigma_m=0.05):
         super().__init__(flown=flown, rate_hz=10.0)
         self.at, self._sigmas = flown, np.repeat([sigma_m, 6e-3 * sigma_m], 3)
-        self._pictures, self._until_s = pictures, until_s
+        self._pictures = pictures
         self._rng = np.random.default_rng(0)
 
     def fly(self, frames=1, state=None):
@@ -127,7 +137,7 @@ def click(watcher, point, delay_s=0.25):
 
 
 def test_a_car_is_followed_through_a_bend_and_found_again_behind_a_roof():
-    watcher = Watcher(Pictures(driving), 14.0)
+    watcher = Watcher(Pictures(driving))
     watcher.fly(8)
     click(watcher, lambda t: (*driving(t)[0], 0.0))
     watcher.fly(110)
@@ -147,7 +157,7 @@ def test_a_car_is_followed_through_a_bend_and_found_again_behind_a_roof():
 
 
 def test_a_place_that_stands_is_never_told_to_move_though_a_car_passes_it():
-    watcher = Watcher(Pictures(driving), 14.0)
+    watcher = Watcher(Pictures(driving))
     watcher.fly(8)
     place = np.array([-8.0, -16.0, 0.0])
     click(watcher, lambda _: place)
@@ -163,25 +173,19 @@ class Crossing(Pictures):
     """A car as grey as its road on a zebra crossing, as three flights lost it."""
 
     def of(self, pose, time_s):
-        image = super().of(pose, time_s).astype(np.float32)
-        d = self._rays @ pose.rotation.T
-        ground = pose.translation + d * (-pose.translation[2] / d[..., 2])[..., None]
-        (x, y), course = self._car_at(time_s)
-        c, s = np.cos(course), np.sin(course)
-        off = ground[..., :2] - (x, y)
-        along = np.stack([c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]], -1)
-        road = 0.15 * image + 75.0
+        ground = self._level(pose, 0.0)
+        along = self._along_car(ground, time_s)
+        road = 0.15 * super().of(pose, time_s).astype(np.float32) + 75.0
         striped = (np.abs(ground[..., 0] + 20.0) < 3.0) & (np.mod(ground[..., 1], 2.4) < 1.2)
         image = np.where(striped, 215.0, road)
         image[(np.abs(along) < (2.5, 1.2)).all(axis=-1)] = 85.0
         for window in (0.9, -1.4):
             image[(np.abs(along - (window, 0.0)) < (0.4, 1.0)).all(axis=-1)] = 45.0
-        blurred = cv2.GaussianBlur(image, (0, 0), 0.7)
-        return np.clip(blurred + np.roll(NOISE, round(time_s * 10) * 7, 1), 0, 255).astype(np.uint8)
+        return self._noisy(cv2.GaussianBlur(image, (0, 0), 0.7), time_s)
 
 
 def test_a_car_that_is_clicked_at_on_a_zebra_crossing_is_followed():
-    watcher = Watcher(Crossing(driving), 14.0, close_by, 0.02)
+    watcher = Watcher(Crossing(driving), close_by, 0.02)
     watcher.fly(22)
     click(watcher, lambda t: (*driving(t)[0], 0.0))
     watcher.fly(35)
@@ -194,39 +198,29 @@ def test_a_car_that_is_clicked_at_on_a_zebra_crossing_is_followed():
     assert watcher.gone == []
 
 
-def test_a_car_that_leaves_unseen_is_not_held_at_its_place_without_a_word():
-    def leaving(time_s):
-        return driving(time_s) if time_s < 2.25 else ((500.0, 500.0), 0.0)
-
-    watcher = Watcher(Pictures(leaving), 14.0)
-    watcher.fly(22)
+@pytest.mark.parametrize(
+    ("gone_s", "before", "after", "told"),
+    [(2.25, 22, 30, AlertId.TARGET_LEFT), (4.0, 8, 100, AlertId.TARGET_LOST)],
+)
+def test_a_car_that_is_gone_is_ended_with_a_word(gone_s, before, after, told):
+    """It is not held at its place, be it that it left unseen or that it does not come back."""
+    watcher = Watcher(Pictures(lambda t: driving(t) if t < gone_s else AWAY))
+    watcher.fly(before)
     click(watcher, lambda t: (*driving(t)[0], 0.0))
-    watcher.fly(30)
-    assert watcher.alerts[-1] == alert(AlertId.TARGET_LEFT, number=1)
+    watcher.fly(after)
+    assert watcher.alerts[-1] == alert(told, number=1)
     assert watcher.gone == ["ground station 1"]
 
 
 @pytest.mark.parametrize("place", [(9.5, -9.5, 8.0), (-9.9, 0.0, 8.0), (-14.0, -20.0, 0.0)])
 def test_a_place_that_stands_has_not_left(place):
     """A roof's corner and edge move against the ground in charts of them, as a car would."""
-    watcher = Watcher(Pictures(driving), 14.0)
+    watcher = Watcher(Pictures(driving))
     watcher.fly(8)
     click(watcher, lambda _: place)
     watcher.fly(45)
     assert watcher.gone == []
     assert [of.id for of in watcher.alerts] == [AlertId.TARGET_FOUND]
-
-
-def test_a_car_that_does_not_come_back_is_lost_with_a_word():
-    def vanishing(time_s):
-        return driving(time_s) if time_s < 4.0 else ((500.0, 500.0), 0.0)
-
-    watcher = Watcher(Pictures(vanishing), 14.0)
-    watcher.fly(8)
-    click(watcher, lambda t: (*driving(t)[0], 0.0))
-    watcher.fly(100)
-    assert watcher.alerts[-1] == alert(AlertId.TARGET_LOST, number=1)
-    assert watcher.gone == ["ground station 1"]
 
 
 class _Slides:
@@ -251,7 +245,11 @@ class _Slides:
 
     def find(self, _gray, estimate, expected, reach_m, was_hidden=False):
         since_s = (estimate.exposure_time_ns - self._begun_ns) * 1e-9
-        at = self._place + np.array([0.0, self.speed * since_s, 0.0])
+        return self._met(estimate, self.speed * since_s, expected, reach_m)
+
+    def _met(self, estimate, way_m, expected, reach_m):
+        """It, `way_m` north of its place, if that is within reach of where it is expected."""
+        at = self._place + np.array([0.0, way_m, 0.0])
         pixel = pixel_of(estimate, at)
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
         return FollowedPosition(at, pixel, 0.9) if near else None
@@ -293,10 +291,7 @@ class _Edge(_Returns):
     def beside(self, gray, estimate, expected, reach_m, since_s):
         if since_s < self.until_s:
             return None
-        at = self._place + np.array([0.0, self.speed * self.until_s + 2.0, 0.0])
-        pixel = pixel_of(estimate, at)
-        near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
-        return FollowedPosition(at, pixel, 0.9) if near else None
+        return self._met(estimate, self.speed * self.until_s + 2.0, expected, reach_m)
 
 
 class _Glimpse(_Slides):
@@ -403,7 +398,6 @@ def test_what_looks_like_it_elsewhere_is_not_taken_for_its_departure(monkeypatch
 # --- A clicked car that stood and is gone: its old place is not told as if it were seen there ---
 
 
-AWAY = ((500.0, 500.0), 0.0)
 PLACE = (-26.0, -14.5)
 
 
@@ -413,7 +407,7 @@ def _told(until_s, gone_s=np.inf, back_s=np.inf):
     def car(time_s):
         return AWAY if gone_s < time_s < back_s else (PLACE, 0.0)
 
-    watcher = Watcher(Crossing(car), until_s, watching, 0.02)
+    watcher = Watcher(Crossing(car), watching, 0.02)
     watcher.fly(8)
     click(watcher, lambda _: (*PLACE, 0.0))
     watcher.fly(round(10 * until_s) - 8)

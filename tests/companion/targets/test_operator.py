@@ -109,7 +109,7 @@ def test_forty_clicks_and_rectangles_with_stops_between_are_each_told_under_thei
             pixel_of(first.estimate, first.fix.position_world), pixel, atol=0.5
         )
         for target in told:  # a life of one place, and no velocity where none was measured
-            assert target.velocity is None
+            assert target.fix.velocity is None
             assert np.linalg.norm(target.fix.position_world - first.fix.position_world) < 0.05
 
 

@@ -1,29 +1,24 @@
-import itertools
 import threading
 import time
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from companion.config import TargetConfig
-from companion.targets.clicks import ClickPolicy
-from companion.targets.detections import Detection
-from companion.targets.history import PoseHistory
-from companion.targets.numbers import TargetNumbers
+from companion.targets.clicks import PoseHistory
+from companion.targets.detections import Detection, TargetNumbers
 from companion.targets.pictures import RecentPictures
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
 from localizer.errors import MapCacheError
 from localizer.geometry.pose import Pose, so3_exp, so3_log
 from localizer.map.cache.pick import BundleHits
-from localizer.types import PoseEstimate, TrackingState
+from localizer.types import PoseEstimate
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.messages import TrackRequest
 from tests.companion.estimates import estimated
 from tests.companion.targets.scene import MS, estimate, pose_at
 
@@ -96,17 +91,10 @@ def test_detections_whose_frame_has_no_position_are_counted():
         assert not s.targets
 
 
-def test_a_ray_into_the_sky_is_counted():
-    with Session(cast=_sky) as s:
-        s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
-        s.reporter.add_estimate(_estimate(50 * MS))
-        assert sleep_until(lambda: s.reporter.missed == 1, 30.0)
-        assert not s.targets
-
-
-def test_a_pixel_beside_the_picture_is_counted_as_missed():
-    with Session() as s:
-        s.reporter.add_detection(Detection("a", 50 * MS, 5000.0, 240.0))
+@pytest.mark.parametrize(("cast", "u"), [(_sky, 320.0), (_ground, 5000.0)])
+def test_a_ray_into_the_sky_and_a_pixel_beside_the_picture_are_counted(cast, u):
+    with Session(cast=cast) as s:
+        s.reporter.add_detection(Detection("a", 50 * MS, u, 240.0))
         s.reporter.add_estimate(_estimate(50 * MS))
         assert sleep_until(lambda: s.reporter.missed == 1, 30.0)
         assert not s.targets
@@ -305,58 +293,3 @@ def test_what_is_dropped_makes_room():
     assert (len(pictures), pictures.nbytes) == (2, 20)
     pictures.append(b"\x09" * 100)  # alone above what is allowed: the newest three stay
     assert [item[0] for item in pictures] == [3, 4, 9]
-
-
-# --- Clicks through the targets' thread; what they mean is in test_operator.py ------------------
-
-
-class Ground:
-    """A ground station that clicks into frames of a camera 100 m above flat ground."""
-
-    def __init__(self):
-        self.targets: list[Any] = []
-        self.alerts: list[Any] = []
-        self.gone: list[Any] = []
-        config = TargetConfig(operator_delay_ms=0.0)
-        self.numbers = itertools.count(1)
-        self.reporter = TargetReporter(config, flat, self.targets.append, on_gone=self.gone.append)
-        self.clicks = ClickPolicy(self.reporter, self.alerts.append, config)
-        self.reporter.start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.reporter.stop()
-
-    def sees(self, time_ns, state=TrackingState.TRACKING):
-        estimate = estimated(time_ns=time_ns, state=state)
-        self.clicks.add_estimate(estimate)
-        self.reporter.add_estimate(estimate)
-
-    def clicks_at(self, x, y, time_ns):
-        self.clicks.on_request(TrackRequest("point", time_ns, (x, y), number=next(self.numbers)))
-
-    def has(self, count):
-        """Whether so many targets were told (each once: no other frame came since)."""
-        return sleep_until(lambda: len({t.fix.target_id for t in self.targets}) >= count, 30.0)
-
-
-def flat(origin, directions):
-    return BundleHits(-origin[2] / directions[:, 2], np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
-
-
-def test_a_second_click_is_a_second_target():
-    """A, then B 60 m away: B was reported as A, twice, and then with A's way to B as velocity."""
-    with Ground() as ground:
-        for k, x in enumerate((0.25, 0.25 + 0.52, 0.25, 0.25 + 0.52)):
-            ground.sees(k * 400 * MS)
-            ground.clicks_at(x, 0.5, k * 400 * MS + 10)
-            assert ground.has(k + 1)
-        places = {
-            t.fix.target_id: tuple(np.round(t.fix.position_world[:2])) for t in ground.targets
-        }
-        a, b = list(places.values())[:2]
-        assert b[0] - a[0] == pytest.approx(60.0, abs=1.0)
-        assert list(places.values()) == [a, b, a, b]
-        assert all(t.velocity is None for t in ground.targets)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.result import trial_verdict
-from companion.trial.run import TrialOptions, run_trial
+from companion.trial.run import run_trial
 from localizer.geometry.camera import Camera
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.building.build import build_cache
@@ -38,7 +38,7 @@ def test_the_gimbals_bias_of_photos_without_gimbal_angles(real_data, tmp_path):
     folder = real_data("fengyuan")
     cache = _map(folder, tmp_path / "map")
     flight = read_footage(folder / "raw", FootageOptions(tmp_path))
-    trial = run_trial(flight, cache, TrialOptions(searches=0))
+    trial = run_trial(flight, cache, searches=0)
     found = trial.estimated
     assert found.mount_deg[1] == pytest.approx(9.0, abs=1.0)
     assert abs(found.mount_deg[2]) < 1.0
@@ -68,7 +68,7 @@ def test_photos_without_tags_beside_a_file_of_places(real_data, tmp_path):
         tmp_path, _FEW, folder / "queries/sensor_prior.txt", camera=tmp_path / "camera.json"
     )
     flight = read_footage(folder / "queries", options)
-    trial = run_trial(flight, cache, TrialOptions(searches=0))
+    trial = run_trial(flight, cache, searches=0)
     assert trial.estimated.camera.fx == pytest.approx(true.fx, rel=0.005)
     frame = TileCache.open(cache).frame
     rows = {r.name: world_from_camera(r, frame) for r in read_poses(folder / "queries/poses.txt")}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from companion.errors import FootageError
+from companion.planning.way import MapHeights
 from companion.recorded.flight import (
     CameraGuess,
     Datum,
@@ -19,7 +20,7 @@ from companion.recorded.flight import (
     Telemetry,
 )
 from companion.trial.localize import Localized
-from companion.trial.priors import Correction, Ground, priors_of
+from companion.trial.priors import Correction, priors_of
 from companion.trial.reasons import map_reason, reasons
 from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, main_reason, trial_verdict
 from companion.trial.wanted_map import wanted_map
@@ -74,13 +75,18 @@ def test_frames_without_the_height_that_others_have_are_counted(cache):
     assert "no usable height in 1 of 4 frames: searched" in found.notes
 
 
-@pytest.mark.parametrize(("ground_m", "told"), [(30.0, 0), (300.0, 1)])
-def test_a_slope_by_the_sea_is_no_sign_of_feet(cache, monkeypatch, ground_m, told):
+@pytest.mark.parametrize(
+    ("ground_m", "factor", "told"),
+    [(30.0, 0.3, 0), (300.0, 0.3, 1), (300.0, 0.6, 0), (300.0, 1.0, 0)],
+)
+def test_a_map_in_feet_is_named_and_a_slope_by_the_sea_is_none(
+    cache, monkeypatch, ground_m, factor, told
+):
     """The take-off was 0.7 of the ground's height below the photos: near the sea that is a hill."""
-    level_m = Ground(cache).height(0.0, 20.0) + cache.frame.origin.height_m
+    level_m = MapHeights(cache).height_m(0.0, 20.0) + cache.frame.origin.height_m
     low = cache.manifest.model_copy(update={"geoid_separation_m": level_m - ground_m})
     monkeypatch.setattr(cache, "manifest", low)
-    heights = Height(0.3 * ground_m + 80.0, Datum.AMSL, 3.0), Height(80.0, Datum.TAKEOFF, 2.0)
+    heights = Height(factor * ground_m + 80.0, Datum.AMSL, 3.0), Height(80.0, Datum.TAKEOFF, 2.0)
     notes = priors_of(_flight(cache.frame, [(0.0, 20.0)] * 4, heights), cache).notes
     assert sum("--height-unit ft" in note for note in notes) == told, notes
 

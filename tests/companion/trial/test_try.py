@@ -18,7 +18,7 @@ from companion.recorded.flight import CameraGuess, LogBeside, RecordedFlight
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.deployment import write_trial_deployment
 from companion.trial.localize import FrameLocalizer, Localized, height_bands, likely_height
-from companion.trial.priors import Ground, priors_of
+from companion.trial.priors import priors_of
 from companion.trial.result import Trial
 from companion.trial.run import evenly_spread, localize_each, localize_from_telemetry
 from localizer.config import LocalizerConfig
@@ -43,11 +43,11 @@ def _photos(folder, sequence, frame: LocalFrame, camera: Camera):
         pose = world_from_camera(row, frame)
         told = frame.position(pose.translation - [_EAST_M, 0.0, 0.0])
         down = so3_exp([-np.radians(_UP_DEG), 0.0, 0.0])  # about the image's right
-        gimbal = gimbal_of_pose(Pose(pose.rotation @ down, pose.translation), frame)
+        roll, pitch, yaw = gimbal_of_pose(Pose(pose.rotation @ down, pose.translation), frame)
         xmp = dji(GpsLatitude=told.latitude_deg, GpsLongitude=told.longitude_deg,
                   AbsoluteAltitude=told.height_m, AltitudeType="RtkAlt",
-                  GimbalRollDegree=gimbal.roll_deg, GimbalPitchDegree=gimbal.pitch_deg,
-                  GimbalYawDegree=gimbal.yaw_deg)  # fmt: skip
+                  GimbalRollDegree=roll, GimbalPitchDegree=pitch,
+                  GimbalYawDegree=yaw)  # fmt: skip
         pixels = np.asarray(Image.open(sequence / "images" / row.name).convert("RGB"))
         focal = camera.fx * 43.267 / np.hypot(camera.width, camera.height)
         name = row.name.rsplit(".", 1)[0] + ".jpg"
@@ -201,13 +201,18 @@ def test_searches_end_where_none_of_the_first_finds_anything():
     assert count({chosen[6]}) == 6
 
 
-def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_assets, tmp_path):
-    """From 82 m, the middle of the whole range, no photo that was taken at 49 m was found."""
+@pytest.fixture
+def prior(small_assets, tmp_path):
+    """Of a photo whose height is not known."""
     cache = TileCache.open(small_assets.map_cache)
     middle = cache.frame.position(np.zeros(3))
     write_photo(tmp_path / "a.jpg", place=(middle.latitude_deg, middle.longitude_deg, 0.0))
     flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    (prior,) = priors_of(flight, cache).priors
+    return priors_of(flight, cache).priors[0]
+
+
+def test_an_unknown_height_is_searched_from_middles_near_any_true_one(prior):
+    """From 82 m, the middle of the whole range, no photo that was taken at 49 m was found."""
     assert not prior.height_known
     ground = prior.height_m - prior.clearance_m
     bands = [(z - ground, sigma) for z, sigma in height_bands(prior)]
@@ -222,38 +227,12 @@ def test_an_unknown_height_is_searched_from_middles_near_any_true_one(small_asse
     ("found", "likely"),
     [((), None), ((31,), None), ((31, 50), None), ((31, 50, 49), 49), ((50, 49, 31), 49)],
 )
-def test_one_photo_of_the_climb_does_not_set_the_height_of_a_flight(
-    small_assets, tmp_path, found, likely
-):
+def test_one_photo_of_the_climb_does_not_set_the_height_of_a_flight(prior, found, likely):
     """With the height of the first photo found, 11 of 12 real ones 20 m above it were lost."""
-    cache = TileCache.open(small_assets.map_cache)
-    middle = cache.frame.position(np.zeros(3))
-    write_photo(tmp_path / "a.jpg", place=(middle.latitude_deg, middle.longitude_deg, 0.0))
-    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    (prior,) = priors_of(flight, cache).priors
     ground = prior.height_m - prior.clearance_m
     bands = likely_height(prior, [ground + height for height in found])
     assert [round(z - ground) for z, _ in bands] == ([likely] if likely else [])
     assert all(5.0 <= sigma < 10.0 for _, sigma in bands)
-
-
-@pytest.mark.parametrize(("factor", "told"), [(1.0, 0), (0.3048, 1), (0.6, 0)])
-def test_a_map_with_heights_in_feet_is_named(small_assets, tmp_path, factor, told):
-    """By the photos' two heights, whose difference is the ground's below the take-off."""
-    cache = TileCache.open(small_assets.map_cache)
-    middle = cache.frame.position(np.zeros(3))
-    height_m = Ground(cache).height(0.0, 0.0)
-    assert height_m is not None
-    assert cache.manifest.geoid_separation_m is not None
-    ground_m = height_m + middle.height_m - cache.manifest.geoid_separation_m
-    assert ground_m > 250.0  # otherwise feet and metres differ by less than these heights err
-    for k in range(4):
-        xmp = dji(GpsLatitude=middle.latitude_deg, GpsLongitude=middle.longitude_deg + 1e-5 * k,
-                  AbsoluteAltitude=factor * ground_m + 60, RelativeAltitude=60)  # fmt: skip
-        write_photo(tmp_path / f"{k}.jpg", xmp, exif={_FOCAL_35: 24})
-    flight = read_footage(tmp_path, FootageOptions(tmp_path, fov_deg=65.0))
-    notes = priors_of(flight, cache).notes
-    assert sum("--height-unit ft" in note for note in notes) == told, notes
 
 
 def test_without_a_map_the_needed_one_is_named(tmp_path):

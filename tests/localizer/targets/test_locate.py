@@ -4,10 +4,10 @@ import pytest
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits, cast_bundle
-from localizer.map.cache.tile import TileMesh
 from localizer.targets.locate import locate, ray_in_world, ray_spread, surface_covariance
 from localizer.targets.track import TargetSettings, TargetTrack
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from tests.companion.targets.scene import square
 
 CAMERA = Camera(640, 480, 550.0, 550.0, 322.0, 238.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
 NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([10.0, 20.0, 120.0]))
@@ -26,19 +26,7 @@ def _ground_hit(pose: Pose, pixel) -> np.ndarray:
     return origin - direction * origin[2] / direction[2]
 
 
-def _square(side: float, height: float) -> TileMesh:
-    """A horizontal square about the origin, with a plain texture."""
-    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) * side / 2
-    return TileMesh(
-        np.column_stack([corners, np.full(4, height)]).astype(np.float32),
-        np.zeros((4, 2), np.float32),
-        np.array([[0, 1, 2], [1, 3, 2]], np.int32),
-        (np.zeros((4, 4, 3), np.uint8),),
-        Pose.identity(),
-    )
-
-
-MESHES = [_square(400.0, 0.0), _square(20.0, 8.0)]
+MESHES = [square(400.0, 0.0), square(20.0, 8.0)]
 
 
 def _cast(origin, directions) -> BundleHits:
@@ -85,7 +73,7 @@ def test_the_shares_of_an_edge_are_those_of_monte_carlo():
     pixel = _pixel_of(NADIR, (9.6, 3.0, 8.0))
     sigma = np.sqrt(estimate.covariance.diagonal())
     heights = []
-    for _ in range(2000):
+    for _ in range(500):
         e = rng.normal(0, sigma)
         moved = Pose(so3_exp(e[3:]) @ NADIR.rotation, NADIR.translation + e[:3])
         at = (pixel[0] + rng.normal(0, 1.5), pixel[1] + rng.normal(0, 1.5))
@@ -114,7 +102,7 @@ def test_covariance_agrees_with_monte_carlo(tilt_deg):
     rng = np.random.default_rng(0)
     sigma = np.sqrt(estimate.covariance.diagonal())
     hits = []
-    for _ in range(4000):
+    for _ in range(2000):
         e = rng.normal(0, sigma)
         moved = Pose(so3_exp(e[3:]) @ pose.rotation, pose.translation + e[:3])
         hits.append(_ground_hit(moved, tuple(np.add(pixel, rng.normal(0, 2.0, 2)))))
@@ -139,7 +127,7 @@ def test_what_strays_from_the_tangent_plane_widens_the_covariance():
 
 def _roofs(half_m):
     """A roof at 8 m over ground, both about the origin: half its side."""
-    meshes = [_square(400.0, 0.0), _square(2.0 * half_m, 8.0)]
+    meshes = [square(400.0, 0.0), square(2.0 * half_m, 8.0)]
     return lambda origin, directions: cast_bundle(meshes, origin, directions)
 
 
