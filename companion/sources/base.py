@@ -12,7 +12,7 @@ from typing import Annotated, Protocol
 import av
 from av.format import Flags
 from av.stream import Disposition
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from companion.errors import StreamOpenError, StreamSizeError
 from companion.sources.datagrams import parse_sender
@@ -21,6 +21,7 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange
 from localizer.types import Frame
+from mavlink_bridge.config import StrictModel
 
 _log = logging.getLogger(__name__)
 _LEAST_SHARE = 10  # a film has at least a tenth of the pictures of the longest: thumbnails have few
@@ -79,10 +80,8 @@ class SourceCounters:
 Count = Annotated[int, Field(ge=0, le=65535)]  # of a 16-bit sensor
 
 
-class SourceSettings(BaseModel):
+class SourceSettings(StrictModel):
     """Settings of a camera feed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     latency_ms: float = Field(
         default=0.0,

@@ -16,13 +16,14 @@ from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.config import StrictModel
 
 Level = Annotated[float, Field(ge=0.0, le=100.0)]
 Factor = Annotated[float, Field(ge=0.2, le=50.0)]
@@ -33,10 +34,9 @@ _REMEMBERED = 32  # pictures under way
 _AGAIN_NS = 10_000_000_000  # the same trouble is reported so often
 
 
-class ZoomTable(BaseModel):
+class ZoomTable(StrictModel):
     """Table of the focal length by zoom level."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     points: tuple[tuple[Level, Factor], ...] = Field(
         min_length=2,
         description="CAMERA_SETTINGS level and focal length as a multiple of `model`'s",
