@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from datetime import date, datetime, timezone
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from companion.config import CompanionConfig
-from companion.errors import ConfigError, ReportError
-from companion.preflight.map_pin import map_hash
+from companion.errors import ReportError
+from companion.offline.record import document
+from companion.preflight.map_pin import readable_map_hash
 from companion.versions import versions
 from companion.writing import write_result
 from localizer.errors import LocalizerError
@@ -125,12 +124,12 @@ def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:
         folder.parent.glob(f"{folder.name}*/health.json"), key=lambda p: p.stat().st_mtime
     )
     for path in reversed(kept):
-        shadow = _read(path).get("shadow")
+        shadow = document(path).get("shadow")
         if isinstance(shadow, dict):  # 0.1 wrote a line; a score that old does not count
             when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
             text = f"{shadow.get('text')} ({path.parent.name}, {_age(when.date(), now.date())})"
             recent = (now - when).days <= _OLD_SHADOW_DAYS
-            flown = _read(path.with_name("record.json")).get("config")
+            flown = document(path.with_name("record.json")).get("config")
             other = isinstance(flown, dict) and flown.get("map") != str(config.map)
             text += ", over another map" if other else ""
             return SheetRow(
@@ -145,14 +144,14 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
         return SheetRow(
             "forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False
         )
-    data = _read(plan)
+    data = document(plan)
     legs = data.get("legs")
     if not isinstance(legs, list) or not isinstance(data.get("holds"), bool):
         raise ReportError(f"--plan {plan}: not a plan.json of `companion plan`")
     bad = [str(leg.get("name")) for leg in legs if not leg.get("holds")]
     conditions = ", ".join(map(str, data.get("conditions", ())))
     mission = Path(str(data.get("mission", "a mission without a name"))).name
-    if data.get("map_sha256") != _hash(flown):
+    if data.get("map_sha256") != (readable_map_hash(flown) or "no map"):
         return SheetRow("forecast", f"{mission}: made over another map than {flown}", False)
     if data["holds"] and not bad:
         text = f"{mission}: vision should work on all {len(legs)} legs ({conditions})"
@@ -162,21 +161,6 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
         f"{', '.join(bad)}"
     )
     return SheetRow("forecast", text, False)
-
-
-def _hash(cache: Path) -> str:
-    try:
-        return map_hash(cache)
-    except ConfigError:
-        return "no map"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return data if isinstance(data, dict) else {}
 
 
 def write_sheet(sheet: PreflightSheet, path: Path) -> tuple[Path, Path]:
