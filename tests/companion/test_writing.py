@@ -208,7 +208,7 @@ def test_what_a_flight_writes_is_not_for_everybody(tmp_path, monkeypatch):
         def run(self) -> None:
             (tmp_path / "record" / "events.csv").write_text("x")
 
-    monkeypatch.setattr("companion.flight.standby.Companion", Flying)
+    monkeypatch.setattr("companion.flight.app.Companion", Flying)
     monkeypatch.setattr("signal.signal", lambda *_: None)
     deployment = Path(__file__).parents[2] / "configs" / "deployment.yaml"
     result = CliRunner().invoke(app, ["run", str(deployment)])
