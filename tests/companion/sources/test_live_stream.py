@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Iterator
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +16,6 @@ import pytest
 
 from companion.errors import StreamDepthError, StreamOpenError, StreamSizeError
 from companion.sources import StreamState, open_source
-from companion.sources.base import fitted_camera
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
 from sitl.camera.stream import LossyLink, VideoSender
@@ -90,9 +88,9 @@ def test_rtp_and_raw_video_are_received_as_transport_streams_are(form, url, tmp_
             picture = av.VideoFrame.from_ndarray(counter_image(number), format="rgb24")
             picture.pts, picture.time_base = number, Fraction(1, 20)
             out.mux(stream.encode(picture))
+            watch.shows(number, 0.05)
             if len(watch.frames) >= 8:
                 break
-            time.sleep(0.05)
     assert watch.error is None
     assert len(watch.frames) >= 8
     numbers = [read_counter(f.image) for f, _ in watch.frames]
@@ -106,9 +104,9 @@ def test_a_stream_that_is_not_read_is_never_told_as_silence(url: str) -> None:
     with Watch(url) as watch, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         mavlink = bytes.fromhex("fd09000001010000000000000000000403")
         watch.wait_until(lambda: StreamState.STALLED in watch.states)  # nothing came yet
-        while not any("MAVLink" in text for _, text in list(watch.told)):
+        told = lambda: any("MAVLink" in text for _, text in watch.told)  # noqa: E731
+        while not watch.comes_true(told, 0.02):
             sender.sendto(mavlink, ("127.0.0.1", int(url.rpartition(":")[2])))
-            time.sleep(0.02)
 
 
 def test_pictures_of_a_second_sender_are_not_mixed_in(url: str) -> None:
@@ -161,7 +159,7 @@ def test_a_stream_that_changes_in_flight_is_scaled_or_reported_until_it_fits(url
 
 def test_closing_ends_the_iteration_before_any_frame_came(url: str) -> None:
     with Watch(url, stall_timeout_s=0.3) as watch:
-        time.sleep(0.2)
+        watch.wait_until(lambda: bool(watch.states))
     assert watch.frames == []
     assert watch.error is None
     assert watch.states[-1] is StreamState.CLOSED
@@ -219,22 +217,18 @@ def test_a_port_in_use_is_reported_and_kept_trying(url: str) -> None:
                 watch.wait_for(3)
 
 
-def test_a_missing_video_device_is_named() -> None:
-    with pytest.raises(StreamOpenError, match=r"/dev/video97.*plugged in"):
-        open_source("/dev/video97", CAMERA)
-
-
-def test_an_rtsp_server_that_is_not_there_is_reported_and_kept_trying() -> None:
-    with Watch("rtsp://127.0.0.1:9/none", retry_max_s=0.3) as watch:
-        watch.wait_until(lambda: StreamState.STALLED in watch.states)
-        assert "cannot connect" in watch.text(StreamState.STALLED)
-    assert watch.error is None
-
-
-@pytest.mark.parametrize("url", ["udp://127.0.0.1", "udp://127.0.0.1:99999", "udp://127.0.0.1:x"])
-def test_an_address_without_a_possible_port_is_named(url):
-    with pytest.raises(StreamOpenError, match="HOST:PORT"):
-        open_source(url, CAMERA)
+@pytest.mark.parametrize(
+    ("location", "why"),
+    [
+        ("/dev/video97", r"/dev/video97.*plugged in"),
+        ("udp://127.0.0.1", "HOST:PORT"),
+        ("udp://127.0.0.1:99999", "HOST:PORT"),
+        ("udp://127.0.0.1:x", "HOST:PORT"),
+    ],
+)
+def test_a_feed_that_cannot_be_is_named(location, why):
+    with pytest.raises(StreamOpenError, match=why):
+        open_source(location, CAMERA)
 
 
 def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(url, monkeypatch):
@@ -306,12 +300,6 @@ def test_pixels_that_cannot_be_converted_are_named_at_the_start(url, monkeypatch
         source.close()
 
 
-@pytest.mark.parametrize("size", [(4, 3), (1, 1), (8, 6)])
-def test_pictures_too_small_for_a_camera_are_misfits(size: tuple[int, int]) -> None:
-    with pytest.raises(StreamSizeError, match=f"delivers {size[0]}x{size[1]}"):
-        fitted_camera(*size, CAMERA, "udp://x:1")
-
-
 _TS_PACKET = 188
 
 
@@ -349,21 +337,16 @@ def test_pictures_after_a_lost_one_are_not_given(url: str, whole: bool) -> None:
         number = 0
         while not watch.frames:  # it joins at a key frame
             sender.send(_rough_image(number), time.monotonic_ns())
+            watch.shows(number, 0.02)
             number += 1
-            time.sleep(0.02)
         joined = number + (-number) % int(rate_hz)  # the next key frame
         lost = joined + 3
         for n in range(number, joined + 2 * int(rate_hz)):
             link.lost = n == lost
             sender.send(_rough_image(n), time.monotonic_ns())
-            if not lost <= n < joined + rate_hz:
-                watch.wait_until(partial(_shows, watch, n))
+            assert lost <= n < joined + rate_hz or watch.shows(n, 60.0)
         sender.close()
     numbers = [read_counter(frame.image) for frame, _ in watch.frames]
     between = [n for n in numbers if joined <= n < joined + rate_hz]
     assert between == [joined, joined + 1, joined + 2]
     assert watch.source.counters.undecodable >= rate_hz - 4
-
-
-def _shows(watch: Watch, number: int) -> bool:
-    return read_counter(watch.frames[-1][0].image) == number
