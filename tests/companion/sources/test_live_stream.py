@@ -18,6 +18,7 @@ from companion.errors import StreamDepthError, StreamOpenError, StreamSizeError
 from companion.sources import StreamState, open_source
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
+from mavlink_bridge.link.link import sleep_until
 from sitl.camera.stream import LossyLink, VideoSender
 from tests.companion.sources.paced_sender import (
     CAMERA,
@@ -301,6 +302,7 @@ def test_pixels_that_cannot_be_converted_are_named_at_the_start(url, monkeypatch
 
 
 _TS_PACKET = 188
+RATE_HZ = 8
 
 
 class _HoledLink:
@@ -329,24 +331,83 @@ def _rough_image(number: int) -> Image:
     return image
 
 
-@pytest.mark.parametrize("whole", [True, False], ids=["whole", "a part"])
-def test_pictures_after_a_lost_one_are_not_given(url: str, whole: bool) -> None:
-    link, rate_hz = _HoledLink(url, whole=whole), 8.0
-    with Watch(url, stall_timeout_s=5.0) as watch:
-        sender = VideoSender(url, CAMERA.width, CAMERA.height, rate_hz, link=link)
+class Steps:
+    """A sender of pictures, each when the test says so; sent: when each was exposed."""
+
+    def __init__(self, url: str, **options: Any) -> None:
+        self.sent: dict[int, int] = {}
+        self._sender = VideoSender(url, CAMERA.width, CAMERA.height, RATE_HZ, **options)
+
+    def send(self, number: int) -> None:
+        self.sent[number] = time.monotonic_ns()
+        self._sender.send(_rough_image(number), self.sent[number])
+
+    def join(self, watch: Watch) -> int:
+        """Send until pictures come, which begin at a key frame; the number of the next one."""
         number = 0
-        while not watch.frames:  # it joins at a key frame
-            sender.send(_rough_image(number), time.monotonic_ns())
+        while not watch.frames:
+            self.send(number)
             watch.shows(number, 0.02)
             number += 1
-        joined = number + (-number) % int(rate_hz)  # the next key frame
+        return number + (-number) % RATE_HZ
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["whole", "a part"])
+def test_each_picture_comes_at_once_but_those_after_a_lost_one(url: str, whole: bool) -> None:
+    """With the time of its exposure, and before the next one is sent."""
+    link = _HoledLink(url, whole=whole)
+    with Watch(url, stall_timeout_s=5.0) as watch:
+        sender = Steps(url, link=link)
+        joined = sender.join(watch)
         lost = joined + 3
-        for n in range(number, joined + 2 * int(rate_hz)):
+        for n in range(max(sender.sent) + 1, joined + 2 * RATE_HZ):
             link.lost = n == lost
-            sender.send(_rough_image(n), time.monotonic_ns())
-            assert lost <= n < joined + rate_hz or watch.shows(n, 60.0)
-        sender.close()
+            sender.send(n)
+            assert lost <= n < joined + RATE_HZ or watch.shows(n, 60.0)
     numbers = [read_counter(frame.image) for frame, _ in watch.frames]
-    between = [n for n in numbers if joined <= n < joined + rate_hz]
+    between = [n for n in numbers if joined <= n < joined + RATE_HZ]
     assert between == [joined, joined + 1, joined + 2]
-    assert watch.source.counters.undecodable >= rate_hz - 4
+    assert watch.source.counters.undecodable >= RATE_HZ - 4
+    for frame, _ in watch.frames:
+        assert abs(frame.exposure_time_ns - sender.sent[read_counter(frame.image)]) < 0.1e6
+    counters, sequences = watch.source.counters, [f.sequence for f, _ in watch.frames]
+    assert counters.received == counters.delivered + counters.dropped
+    assert counters.delivered == len(sequences)
+    assert sequences == sorted(set(sequences))
+
+
+def test_by_presentation_times_an_exposure_is_the_arrival_less_what_was_measured(url):
+    options = {"timing": "pts", "latency_ms": 300, "time_offset_ms": -20, "stall_timeout_s": 5.0}
+    with Watch(url, **options) as watch:
+        sender = Steps(url, misp=False)
+        begun = sender.join(watch)
+        for n in range(max(sender.sent) + 1, begun + RATE_HZ):
+            sender.send(n)
+            assert watch.shows(n, 60.0)
+    lags = []
+    for frame, seen_ns in watch.frames:
+        sent_ns = sender.sent[read_counter(frame.image)]
+        lags.append(frame.exposure_time_ns + 280e6 - sent_ns)  # the smallest lag so far
+        assert -0.1e6 < lags[-1] < seen_ns - sent_ns
+    assert np.diff(lags).max() < 0.1e6
+
+
+def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(url):
+    sender, source = Steps(url), open_source(url, CAMERA)
+    frames, taken = source.frames(), []
+    feed = threading.Thread(target=lambda: taken.append(next(frames)))
+    feed.start()
+    number = 0
+    while feed.is_alive():
+        sender.send(number)
+        number += 1
+        feed.join(0.02)
+    for n in range(number, number + 5):
+        received = source.counters.received
+        sender.send(n)
+        assert sleep_until(lambda r=received: source.counters.received > r, 60.0)
+    newest, counters = next(frames), source.counters
+    source.close()
+    assert newest.sequence >= taken[0].sequence + 5
+    assert counters.dropped == newest.sequence - taken[0].sequence - 1
+    assert counters.delivered == 2
