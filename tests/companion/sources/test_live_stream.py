@@ -101,7 +101,8 @@ def test_rtp_and_raw_video_are_received_as_transport_streams_are(form, url, tmp_
         assert np.ptp(times) < 1.0
 
 
-def test_a_stream_that_is_not_read_is_never_told_as_silence(url: str) -> None:
+def test_a_stream_that_is_not_read_is_never_told_as_silence(url, monkeypatch):
+    monkeypatch.setattr("companion.sources.av_source._OPEN_TIMEOUT_S", 0.2)
     with Watch(url) as watch, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         mavlink = bytes.fromhex("fd09000001010000000000000000000403")
         watch.wait_until(lambda: StreamState.STALLED in watch.states)  # nothing came yet
