@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from datetime import date, datetime, timezone
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from companion.config import CompanionConfig
 from companion.errors import ReportError
-from companion.offline.record import document
 from companion.preflight.map_pin import readable_map_hash
 from companion.versions import versions
 from companion.writing import write_result
@@ -124,12 +125,12 @@ def _shadow(config: CompanionConfig, now: datetime) -> SheetRow:
         folder.parent.glob(f"{folder.name}*/health.json"), key=lambda p: p.stat().st_mtime
     )
     for path in reversed(kept):
-        shadow = document(path).get("shadow")
+        shadow = _read(path).get("shadow")
         if isinstance(shadow, dict):  # 0.1 wrote a line; a score that old does not count
             when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
             text = f"{shadow.get('text')} ({path.parent.name}, {_age(when.date(), now.date())})"
             recent = (now - when).days <= _OLD_SHADOW_DAYS
-            flown = document(path.with_name("record.json")).get("config")
+            flown = _read(path.with_name("record.json")).get("config")
             other = isinstance(flown, dict) and flown.get("map") != str(config.map)
             text += ", over another map" if other else ""
             return SheetRow(
@@ -144,7 +145,7 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
         return SheetRow(
             "forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False
         )
-    data = document(plan)
+    data = _read(plan)
     legs = data.get("legs")
     if not isinstance(legs, list) or not isinstance(data.get("holds"), bool):
         raise ReportError(f"--plan {plan}: not a plan.json of `companion plan`")
@@ -161,6 +162,14 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
         f"{', '.join(bad)}"
     )
     return SheetRow("forecast", text, False)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) else {}
 
 
 def write_sheet(sheet: PreflightSheet, path: Path) -> tuple[Path, Path]:
