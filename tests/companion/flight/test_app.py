@@ -151,7 +151,7 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(deployed, fails,
             raise OSError("no more threads")
 
     memory, feed, failures = _Memory(), _StubFeed(), []
-    health = SimpleNamespace(end=lambda _, is_failure: failures.append(is_failure))
+    health: Any = SimpleNamespace(end=lambda _, is_failure: failures.append(is_failure))
     feed.ended = threading.Event()
     feed.ended.set()
     feed.error = StreamOpenError("gone") if fails == "feed" else None

@@ -134,7 +134,7 @@ def _bridged(seconds):
     ],
 )  # fmt: skip
 def test_the_worst_thing_is_told_with_what_is_true_beside_it(tmp_path, estimate, given, told):
-    bridge, events = FakeBridge(), []
+    bridge, events = FakeBridge(), list[tuple[str, str]]()
     monitor = _monitor(tmp_path, bridge, events=events, **given)
     _one_report(monitor, *([] if estimate is None else [estimate]))
     assert bridge.told[-1] == told
@@ -176,7 +176,7 @@ def test_the_file_has_the_report_as_json(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_is_an_event_and_the_bridge_is_still_told(tmp_path):
-    bridge, events = FakeBridge(), []
+    bridge, events = FakeBridge(), list[tuple[str, str]]()
     _one_report(_monitor(tmp_path / "gone", bridge, events=events))
     assert bridge.told
     assert any("cannot be written" in text for _, text in events)

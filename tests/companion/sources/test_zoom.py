@@ -129,7 +129,7 @@ class Lens:
 
     def see(self, pictures: int) -> float:
         """The factor over the table's, in the last of so many more."""
-        by_table = self.table.factor(self.level)
+        by_table = self.table.factor(self.level) or math.nan
         for _ in range(pictures):
             given = self.take()
             self.zoomed.learn(fitted(self.time_ns, by_table * self.truth / given))

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -128,7 +129,7 @@ class Stage:
             self._wait,
         )
 
-    def _spawn(self, standby: bool) -> Scripted:
+    def _spawn(self, standby: bool) -> Any:
         if self.refusals > 0 and self.spawned:
             self.refusals -= 1
             raise BlockingIOError(11, "Resource temporarily unavailable")
