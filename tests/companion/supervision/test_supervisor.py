@@ -251,7 +251,7 @@ def test_an_order_to_end_is_passed_on_and_the_standby_dismissed() -> None:
 
 
 def test_what_cannot_be_told_does_not_keep_it_from_flying() -> None:
-    flights = [Scripted(1, -9), Scripted(1, 0)]
+    flights: list[Any] = [Scripted(1, -9), Scripted(1, 0)]
 
     def fails(*_: object) -> None:
         raise OSError("no such port")
