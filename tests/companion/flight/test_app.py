@@ -177,7 +177,7 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(deployed
         bridge.stop()
 
     parts = [replace(p, stop=stop_with_last_words) if p.kind is Bridge else p for p in COMPONENTS]
-    for i in range(15):  # 3 s of flight
+    for i in range(25):  # 5 s of flight
         cv2.imwrite(str(tmp_path / f"{i:02}.png"), np.full((120, 160, 3), 3 * i, np.uint8))
     threads = set(threading.enumerate())
     with EmbeddedSitl(HOME, parameters={**vision_parameters(), **GIMBAL}) as vehicle:
