@@ -65,7 +65,10 @@ def test_a_leg_over_a_hole_is_found_although_its_ends_are_inside(cache):
 
 def test_doctor_against_the_embedded_vehicle(cache, small_assets, tmp_path, monkeypatch):
     # What a busy machine does to the line between two processes is not the subject here.
-    for name, loose in (("_ROUND_TRIP_LIMIT_MS", 1e4), ("_RATE_SHARE", 0.02), ("_LOST_SHARE", 0.9)):
+    for name, loose in (
+        ("_ROUND_TRIP_LIMIT_MS", 1e4), ("_RATE_SHARE", 0.02), ("_LOST_SHARE", 0.9),
+        ("_MEASURE_S", 1.0),
+    ):  # fmt: skip
         monkeypatch.setattr(f"mavlink_bridge.preflight.doctor.{name}", loose)
     for i in range(12):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((120, 160, 3), 10 * i, np.uint8))
