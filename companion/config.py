@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from companion.errors import ConfigError
 from companion.integrity_monitor.config import IntegrityMonitorConfig
@@ -25,6 +25,7 @@ from localizer.map.kind import MapKind
 from localizer.sensors.error_model import SENSORS
 from mavlink_bridge.config import BridgeConfig, StrictModel
 
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
 _MOST_PX = 8192  # of a side of a stream's picture
 _CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
@@ -282,72 +283,45 @@ def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
     about old keys. Paths stay as given (`resolved`). `ConfigError` lists all problems.
     """
     try:
-        config = validated(CompanionConfig, with_current_keys(CompanionConfig, data, where))
-        config.camera.model.camera()
+        return validated(CompanionConfig, with_current_keys(CompanionConfig, data, where))
     except SettingsError as error:
         count = len(str(error).splitlines())
         raise ConfigError(f"{where}: {count} problem(s)\n{error}") from error
-    except CameraError as error:
-        raise ConfigError(f"{where}: camera.model: {error}") from error
-    return config
 
 
 def resolved(config: CompanionConfig, folder: Path) -> CompanionConfig:
     """A copy whose relative paths start at `folder`. Sets also where signed links store their time
     stamps (in `state_dir`). ValueError for an empty path; whether a file exists is not checked.
     """
-    localizer = config.localizer
-    if localizer.model is not None:
-        model = _path(folder, localizer.model, "localizer.model")
-        localizer = localizer.model_copy(update={"model": model})
-    if localizer.terrain is not None:
-        terrain = _path(folder, localizer.terrain, "localizer.terrain")
-        localizer = localizer.model_copy(update={"terrain": terrain})
-    record = config.record
-    if record is not None:
-        place = _path(folder, record.folder, "record.folder")
-        record = record.model_copy(update={"folder": place})
     camera = config.camera
     if "://" not in camera.source:  # a device, a file or a folder
         source = _path(folder, Path(camera.source), "camera.source")
         camera = camera.model_copy(update={"source": str(source)})
-    targets = config.targets
-    if targets.detector is not None:
-        network = _path(folder, targets.detector.model, "targets.detector.model")
-        detector = targets.detector.model_copy(update={"model": network})
-        targets = targets.model_copy(update={"detector": detector})
-    state_dir = config.state_dir and _path(folder, config.state_dir, "state_dir")
-    update = {
-        "map": _path(folder, config.map, "map"),
-        "camera": camera,
-        "localizer": localizer,
-        "bridge": _resolve_bridge(config.bridge, folder, state_dir),
-        "targets": targets,
-        "state_dir": state_dir,
-        "record": record,
-        "console": _resolve_console(config.console, folder),
-    }
-    return config.model_copy(update=update)
+    found = _with_paths(config, folder, "")
+    bridge = _with_state_files(found.bridge, found.state_dir)
+    return found.model_copy(update={"camera": camera, "bridge": bridge})
 
 
-def _resolve_console(console: ConsoleConfig | None, folder: Path) -> ConsoleConfig | None:
-    if console is None:
-        return None
-    given = {name: getattr(console, name) for name in ("token_file", "tls_certificate", "tls_key")}
-    update = {name: _path(folder, path, f"console.{name}") for name, path in given.items() if path}
-    return console.model_copy(update=update)
-
-
-def _resolve_bridge(bridge: BridgeConfig, folder: Path, state_dir: Path | None) -> BridgeConfig:
+def _with_paths(model: _ModelT, folder: Path, section: str) -> _ModelT:
+    """A copy whose paths start at `folder`, those of nested models included. section: for errors,
+    with a dot at its end; "" for the whole deployment.
+    """
     update: dict[str, Any] = {}
-    if bridge.tlog is not None:
-        update["tlog"] = _path(folder, bridge.tlog, "bridge.tlog")
+    for name, value in model:
+        if isinstance(value, BaseModel):
+            update[name] = _with_paths(value, folder, f"{section}{name}.")
+        elif isinstance(value, Path):
+            update[name] = _path(folder, value, f"{section}{name}")
+    return model.model_copy(update=update)
+
+
+def _with_state_files(bridge: BridgeConfig, state_dir: Path | None) -> BridgeConfig:
+    update: dict[str, Any] = {}
     for name, link in (("signing", "fc"), ("ground_signing", "ground")):
         signing = getattr(bridge, name)
         if signing is not None:
-            key_file = _path(folder, signing.key_file, f"bridge.{name}.key_file")
-            seen = state_dir and state_dir / f"{key_file.name}.{link}.seen"
-            update[name] = signing.model_copy(update={"key_file": key_file, "state_file": seen})
+            seen = state_dir and state_dir / f"{signing.key_file.name}.{link}.seen"
+            update[name] = signing.model_copy(update={"state_file": seen})
     return bridge.model_copy(update=update)
 
 

@@ -62,7 +62,7 @@ def vision_fix(
     """The vehicle's position and attitude from the camera's estimate; for accepted estimates.
 
     attitude, gimbal: at the exposure. Together they give the camera's orientation on the body.
-    reset_count: number of jumps so far (`JumpCounter.count`).
+    reset_count: number of jumps so far (`FixInjection`).
     Without them the vehicle's attitude is unknown. The camera's position is then reported as that
     of the vehicle, and the square of the lever arm's length is added to the variance of each axis.
     """

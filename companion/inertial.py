@@ -13,49 +13,19 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.messages import Attitude, GimbalAttitude, InertialSample, VehicleState
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.messages import Attitude, InertialSample
 
 Array = NDArray[np.float64]
 _LEAN_S = 20.0  # towards the autopilot's attitude
 _BIAS_S = 60.0  # of the gyros' bias
 _GAP_S = 0.3  # longer without samples the motion is unknown
 _KEPT = 1024
-
-
-class AttitudeTelemetry(Protocol):
-    """The vehicle's state and attitudes: from the bridge in flight, from a record afterwards."""
-
-    def state(self) -> VehicleState:
-        """Newest state of the vehicle."""
-        ...
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
-        ...
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a CLOCK_MONOTONIC time; None if unknown."""
-        ...
-
-
-class VehicleTelemetry(AttitudeTelemetry, Protocol):
-    """The vehicle's telemetry that the monitor reads from the bridge, without impossible values."""
-
-    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """IMU samples after a time, oldest first."""
-        ...
-
-    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude (degrees) and altitude AMSL (m) at a time; None unless it
-        uses GNSS.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -85,7 +55,7 @@ class InertialTrack:
         self._last: tuple[int, Array] | None = None
         self._track: deque[InertialDisplacement] = deque(maxlen=_KEPT)
 
-    def follow(self, vehicle: VehicleTelemetry) -> None:
+    def follow(self, vehicle: Bridge) -> None:
         """Integrate the vehicle's samples since the newest one integrated."""
         with self._lock:
             for sample in vehicle.inertial_since(self.newest_ns):
@@ -115,14 +85,11 @@ class InertialTrack:
     def at(self, time_ns: int) -> InertialDisplacement | None:
         """The integral at a time, linear between samples; None outside of the newest 1024."""
         with self._lock:
-            return self._at(time_ns)
-
-    def _at(self, time_ns: int) -> InertialDisplacement | None:
-        track = self._track
-        if not track or not track[0].time_ns <= time_ns <= track[-1].time_ns:
-            return None
-        after = bisect_left(track, time_ns, key=lambda m: m.time_ns)
-        a, b = track[max(after - 1, 0)], track[after]
+            track = self._track
+            if not track or not track[0].time_ns <= time_ns <= track[-1].time_ns:
+                return None
+            after = bisect_left(track, time_ns, key=lambda m: m.time_ns)
+            a, b = track[max(after - 1, 0)], track[after]
         span = b.time_ns - a.time_ns
         t = (time_ns - a.time_ns) / span if span else 1.0
         velocity = a.velocity + t * (b.velocity - a.velocity)

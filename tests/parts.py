@@ -37,7 +37,6 @@ FLIES = (
 RUNS_ALONE = (
     "tests/companion/console/test_browser.py",
     "tests/companion/flight/test_app.py",
-    "tests/companion/sources/test_live_timing.py",
     "tests/companion/sources/test_rtsp.py",
     "tests/sitl/demo/test_flight.py",
     "tests/sitl/suite/test_loop_flights.py",

@@ -24,19 +24,51 @@ _LATE = 3  # index of the delay; before it the angles, rad
 _SIGMAS = np.array([*np.radians([10.0, 5.0, 5.0]), 0.3])
 _WALKS = np.array([*np.radians([0.15, 0.05, 0.05]), 0.006])  # per root second
 _NOISE_RAD = np.radians([SENSORS.heading_step_deg, SENSORS.tilt_step_deg, SENSORS.tilt_step_deg])
+_OUTLIER = 5.0  # sigmas
 _ANEW = 4  # outliers in a row, after which what was learned is void
 _TURNS_RADPS = 0.1
 _LEVEL_TURN = 0.2  # below this horizontal part of the axis "forward" is the picture's top
 
 
-class AttitudeFilter:
+class ErrorFilter:
+    """Kalman filter that is updated by one scalar measurement after the other. sigmas: of the
+    unknown states, which are zero at first.
+    """
+
+    def __init__(self, sigmas: Array) -> None:
+        self._sigmas = sigmas
+        self._x = np.zeros(len(sigmas))
+        self._cov = np.diag(np.square(sigmas))
+
+    def _correct(self, H: Array, innovation: float, sigma: float) -> bool:
+        """Update with one measurement; False if it is an outlier, which is ignored."""
+        PH = self._cov @ H
+        S = float(H @ PH) + sigma**2
+        if innovation**2 > _OUTLIER**2 * S:
+            return False
+        K = PH / S
+        self._x = self._x + K * innovation
+        self._cov = self._cov - np.outer(K, PH)
+        self._cov = 0.5 * (self._cov + self._cov.T)
+        return True
+
+    def _loosen(self, *states: int) -> None:
+        """Increase the variance of some states and remove their correlations; keep their values."""
+        for i in states:
+            self._cov[i, :] = self._cov[:, i] = 0.0
+            self._cov[i, i] = self._sigmas[i] ** 2
+
+    def _figure(self, at: int) -> CalibrationEstimate:
+        return CalibrationEstimate(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
+
+
+class AttitudeFilter(ErrorFilter):
     """Kalman filter of boresight and time offset. Takes observations in time order, a few times a
     second; one thread.
     """
 
     def __init__(self) -> None:
-        self._x = np.zeros(4)
-        self._cov = np.diag(np.square(_SIGMAS))
+        super().__init__(_SIGMAS)
         self._outliers = 0
 
     @property
@@ -53,7 +85,7 @@ class AttitudeFilter:
 
     def forget_time_offset(self) -> None:
         """Reset the time offset to unknown."""
-        self._forget([_LATE])
+        self._loosen(_LATE)
 
     def add(
         self, seen: CalibrationObservation, known: AutopilotObservation, seconds: float
@@ -72,29 +104,13 @@ class AttitudeFilter:
         for i in range(3):
             H = np.zeros(4)
             H[i], H[_LATE] = 1.0, -turn[i]
-            PH = self._cov @ H
-            S = float(H @ PH) + _NOISE_RAD[i] ** 2
-            innovation = float(off[i] - H @ self._x)
-            if innovation**2 > 25.0 * S:
-                agreed = False
-                continue
-            K = PH / S
-            self._x = self._x + K * innovation
-            self._cov = self._cov - np.outer(K, PH)
+            agreed &= self._correct(H, float(off[i] - H @ self._x), _NOISE_RAD[i])
         self._outliers = 0 if agreed else self._outliers + 1
         if self._outliers >= _ANEW:
             # In a turn a stream that began to lag looks like this, else a gimbal that was knocked.
             lags = float(np.linalg.norm(known.turn)) > _TURNS_RADPS
-            self._forget([_LATE] if lags else [0, 1, 2])
+            self._loosen(*([_LATE] if lags else [0, 1, 2]))
             self._outliers = 0
-
-    def _forget(self, states: list[int]) -> None:
-        for i in states:
-            self._cov[i, :] = self._cov[:, i] = 0.0
-            self._cov[i, i] = _SIGMAS[i] ** 2
-
-    def _figure(self, at: int) -> CalibrationEstimate:
-        return CalibrationEstimate(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
 
 
 def level_axes(ned_from_camera: Array) -> Array:

@@ -11,17 +11,17 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from localizer.geometry.pose import Array
 from localizer.types import PoseEstimate, TrackingState
-from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Direction, MapOffsetUse
-from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.messages import VisionFix
 from mavlink_bridge.vehicle.origin import north_east, offset
 from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS
 
@@ -39,22 +39,6 @@ _SLEW_M_S = 0.2  # of what is applied: far below what the EKF or the monitor tak
 _WINDS = tuple(Direction)
 
 Policy = Literal["tell", "apply"]
-
-
-class MapOffsetTelemetry(Protocol):
-    """The bridge's telemetry that the estimator reads."""
-
-    def state(self) -> VehicleState:
-        """Newest state of the vehicle."""
-        ...
-
-    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """As of `VehicleTelemetry`: the EKF's position at a time; None unless it uses GNSS."""
-        ...
-
-    def report_alert(self, alert: Alert) -> None:
-        """Report an alert to the operator."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -102,7 +86,7 @@ class MapOffsetEstimator:
 
     def __init__(
         self,
-        vehicle: MapOffsetTelemetry,
+        vehicle: Bridge,
         policy: Policy,
         event: Callable[[str, str], None],
         *,

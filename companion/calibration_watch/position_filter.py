@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.calibration_watch.attitude_filter import ErrorFilter
 from companion.calibration_watch.observation import (
     AutopilotObservation,
     CalibrationEstimate,
@@ -31,20 +32,18 @@ _SIGMAS = np.array([1e3, 1e3, 15, 15, 0.3, 0.3, 2.0, 2.0, 0.03, 0.15, 100.0, 100
 _WALKS = np.array([0, 0, 0, 0, 0.02, 0.02, 0.15, 0.15, 3e-4, 0.006, 0.25, 0.15, 1e-4])
 _VISION_M = 0.25  # errors of vision that last longer than from one sighting to the next
 _GNSS_M, _GNSS_HEIGHT_M, _PRESSURE_M = 0.5, 1.0, 0.5
-_OUTLIER = 5.0  # sigmas; one is dropped, several in a row restart
-_ANEW = 8
+_ANEW = 8  # outliers in a row, after which the motion is unknown
 _SLOW_MPS = 1.0
 _ZOOMED = 3  # sightings in a row that contradict what was known: the lens may be another now
 
 
-class PositionFilter:
+class PositionFilter(ErrorFilter):
     """Kalman filter of focal length and time offset. Takes observations in time order, a few times
     a second; one thread.
     """
 
     def __init__(self) -> None:
-        self._x = np.zeros(_SIZE)
-        self._cov = np.diag(np.square(_SIGMAS))
+        super().__init__(_SIGMAS)
         self._outliers = 0
         self._contradicted = 0
         self._height0: float | None = None
@@ -62,12 +61,11 @@ class PositionFilter:
 
     def forget_motion(self) -> None:
         """Reset position, velocity and IMU bias to unknown, after a gap or a jump of vision."""
-        for at in (_P, _V, _A):
-            self._loosen(at, 2)
+        self._forget(_P, _P + 1, _V, _V + 1, _A, _A + 1)
 
     def forget_time_offset(self) -> None:
         """Reset the time offset to unknown."""
-        self._loosen(_T, 1)
+        self._forget(_T)
 
     def predict(self, moved: Array, faster: Array, seconds: float) -> None:
         """Predict with the IMU over `seconds`. moved: displacement beyond that of the velocity, m;
@@ -120,7 +118,7 @@ class PositionFilter:
         self._outliers = 0 if agreed else self._outliers + 1
         if self._outliers >= _ANEW:
             self.forget_motion()
-            self._loosen(_T, 1)  # a stream that began to lag looks like this
+            self._forget(_T)  # a stream that began to lag looks like this
             self._outliers = 0
         if known.north_east_m is not None:
             for i in (0, 1):
@@ -130,7 +128,7 @@ class PositionFilter:
                 agreed &= self._correct(H, measured - float(H @ self._x), _GNSS_M)
         self._contradicted = self._contradicted + 1 if contradicted or not agreed else 0
         if self._contradicted >= _ZOOMED:
-            self._loosen(_F, 1, keep=True)
+            self._loosen(_F)
             self._contradicted = 0
 
     def _heights(
@@ -163,26 +161,6 @@ class PositionFilter:
             agreed &= self._correct(H, difference - zero - float(H @ self._x), sigma)
         return agreed
 
-    def _correct(self, H: Array, innovation: float, sigma: float) -> bool:
-        """Update with one scalar measurement; False if it is an outlier, which is ignored."""
-        PH = self._cov @ H
-        S = float(H @ PH) + sigma**2
-        if innovation**2 > _OUTLIER**2 * S:
-            return False
-        K = PH / S
-        self._x = self._x + K * innovation
-        self._cov = self._cov - np.outer(K, PH)
-        self._cov = 0.5 * (self._cov + self._cov.T)
-        return True
-
-    def _loosen(self, at: int, count: int, *, keep: bool = False) -> None:
-        """Increase the variance of some states and remove their correlations. keep: keep their
-        values.
-        """
-        for i in range(at, at + count):
-            self._cov[i, :] = self._cov[:, i] = 0.0
-            self._cov[i, i] = _SIGMAS[i] ** 2
-            self._x[i] = self._x[i] if keep else 0.0
-
-    def _figure(self, at: int) -> CalibrationEstimate:
-        return CalibrationEstimate(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
+    def _forget(self, *states: int) -> None:
+        self._loosen(*states)
+        self._x[list(states)] = 0.0

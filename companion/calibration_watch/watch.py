@@ -18,9 +18,10 @@ from companion.calibration_watch.observation import (
 )
 from companion.calibration_watch.position_filter import PositionFilter
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.inertial import InertialDisplacement, InertialTrack, VehicleTelemetry
+from companion.inertial import InertialDisplacement, InertialTrack
 from localizer.geometry.pose import matrix_from_quaternion, so3_log
 from mavlink_bridge.alerts.words import CalibrationError
+from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
@@ -104,7 +105,7 @@ class CalibrationWatch:
         """
         self._doubted_ns = since_ns
 
-    def step(self, now_ns: int, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
+    def step(self, now_ns: int, vehicle: Bridge, track: InertialTrack) -> None:
         """Process the observations that are 0.7 s old, when the autopilot's data of their time is
         there; called a few times a second. track: already integrated (`InertialTrack.follow`).
         """
@@ -163,7 +164,7 @@ class CalibrationWatch:
         self,
         seen: CalibrationObservation,
         state: VehicleState,
-        vehicle: VehicleTelemetry,
+        vehicle: Bridge,
         track: InertialTrack,
     ) -> None:
         gap_s = (seen.time_ns - self._last_ns) * 1e-9
@@ -199,7 +200,7 @@ class CalibrationWatch:
         self._position.add(place, seen, known, climb)
 
     def _evidence(
-        self, seen: CalibrationObservation, state: VehicleState, vehicle: VehicleTelemetry
+        self, seen: CalibrationObservation, state: VehicleState, vehicle: Bridge
     ) -> AutopilotObservation:
         t = seen.time_ns
         reported = [vehicle.gimbal_at(t + dt) for dt in (0, -_RATE_NS, _RATE_NS)]

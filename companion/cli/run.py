@@ -61,7 +61,7 @@ def run_command(
     changes = {key: value for key, value in given.items() if value is not None}
     localizer = settings.localizer.model_copy(update=changes)
     settings = settings.model_copy(update={"localizer": localizer})
-    from companion.flight.standby import released_companion
+    from companion.flight.app import released_companion
 
     companion = released_companion(
         settings, standby=standby, pulse=pulse, restart=restart, lost_settings=lost

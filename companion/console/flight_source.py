@@ -10,7 +10,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from companion.console.source import Newest
+from companion.console.source import ConsoleSource
 from companion.live.protocol import LinkError, Message, MessageDecoder, encode
 from companion.live.shared import SharedMemoryReader
 
@@ -20,26 +20,21 @@ _ANSWER_S = 3.0
 _READ = 1 << 20
 
 
-class FlightSource:
+class FlightSource(ConsoleSource):
     """Connects to the flight again and again. The last data stay, marked as not connected."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self._path = path
-        self.newest = Newest()
         self._connection: socket.socket | None = None
         self._wanted = False
         self._answers: dict[int, asyncio.Future[tuple[bool, str]]] = {}
         self._numbers = itertools.count(1)
-        self._event = asyncio.Event()
 
     @property
     def is_connected(self) -> bool:
         """Whether the flight is connected."""
         return self._connection is not None
-
-    async def changed(self) -> None:
-        """Wait until there are new data, or the connection changes."""
-        await self._event.wait()
 
     def watch(self, wanted: bool) -> None:
         """Request frames from the flight, or stop; also from the next one that connects."""
@@ -126,11 +121,6 @@ class FlightSource:
         future = self._answers.get(head.get("number", 0))
         if future is not None and not future.done():
             future.set_result((bool(head.get("ok")), str(head.get("text", ""))))
-
-    def _wake_waiters(self) -> None:
-        """Wake everybody that waits in `changed`."""
-        event, self._event = self._event, asyncio.Event()
-        event.set()
 
     def _send(self, head: dict[str, Any]) -> None:
         """Send a message whole, or close: a flight that does not read at once hangs."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.console.kept_pictures import KeptPictures
 from companion.console.record_rows import ABSURD, estimate_of, last_row, target_of
-from companion.console.source import Newest, sample_of
+from companion.console.source import ConsoleSource, sample_of
 from companion.live.protocol import Message
 from companion.offline.record import RecordTables
 from companion.reporting.pictures import MapPictures
@@ -25,12 +25,13 @@ _RATE_S, _LATENCY_S = 3.0, 10.0  # over which rate and latency are reported
 _HEARD_NS = 2_000_000_000  # a place of autopilot or receiver holds so long
 
 
-class ReplaySource:
+class ReplaySource(ConsoleSource):
     """Plays the record's rows at their original speed. pictures: renderer of the map; without it
     there is neither the map view nor the autopilot's track.
     """
 
     def __init__(self, tables: RecordTables, pictures: MapPictures | None = None) -> None:
+        super().__init__()
         self._tables = tables
         self._map = pictures
         self._tracks = AutopilotTracks()
@@ -38,27 +39,13 @@ class ReplaySource:
             clock = tables.start_ns, tables.utc_ns
             self._tracks = read_autopilot(tables.tlog, *clock, pictures)
         self._residuals = self._gnss_residuals()
-        self.newest = Newest()
         times = tables.estimates.get("exposure_time_ns", np.empty(0, np.int64))
         self._start_ns = int(times[0]) if len(times) else 0
         self._length_s = (int(times[-1]) - self._start_ns) * 1e-9 if len(times) else 0.0
         self._at_s = 0.0
         self._playing = True
         self._told = 0
-        self._event = asyncio.Event()
         self._pictures = KeptPictures(tables, pictures)
-
-    @property
-    def is_connected(self) -> bool:
-        """Always true."""
-        return True
-
-    def watch(self, wanted: bool) -> None:
-        """Does nothing: frames are read when their time comes."""
-
-    async def changed(self) -> None:
-        """Wait for the next step."""
-        await self._event.wait()
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
         """Jump (share: part of the flight, 0 to 1), else go on or pause (play); whether it is
@@ -90,8 +77,7 @@ class ReplaySource:
         now_ns = self._start_ns + round(self._at_s * 1e9)
         self.newest.add(Message(self._state(now_ns)))
         await self._take_picture(now_ns)
-        event, self._event = self._event, asyncio.Event()
-        event.set()
+        self._wake_waiters()
 
     def _fill_samples(self) -> None:
         """Fill plots and tracks up to the time of the time bar."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from companion.live.protocol import Message
 
@@ -52,34 +53,37 @@ class Newest:
         return bool(vehicle.get("armed")) if vehicle.get("connected") else None
 
 
-class ConsoleSource(Protocol):
-    """Data source of the console: a running flight or a record."""
+class ConsoleSource:
+    """Data source of the console: a running flight or a record. newest: the data to show."""
 
-    @property
-    def newest(self) -> Newest:
-        """The data to show."""
-        ...
+    def __init__(self) -> None:
+        self.newest = Newest()
+        self._event = asyncio.Event()
 
     @property
     def is_connected(self) -> bool:
         """Whether the source delivers data now."""
-        ...
+        return True
 
     def watch(self, wanted: bool) -> None:
-        """Request frames, or stop."""
-        ...
+        """Request frames, or stop; without effect where frames come by themselves."""
 
     async def changed(self) -> None:
-        """Wait until there are new data."""
-        ...
+        """Wait until there are new data, or the connection changes."""
+        await self._event.wait()
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
         """Send an order; returns whether it was executed, and a text."""
-        ...
+        raise NotImplementedError
 
     async def run(self) -> None:
         """Read the source until cancelled."""
-        ...
+        raise NotImplementedError
+
+    def _wake_waiters(self) -> None:
+        """Wake everybody that waits in `changed`."""
+        event, self._event = self._event, asyncio.Event()
+        event.set()
 
 
 def sample_of(state: dict[str, Any]) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ class TopTiles:
     def __init__(self, map_path: Path) -> None:
         self._cache = TileCache.open(map_path)
         self._lock = threading.Lock()
-        self._kept: OrderedDict[TileName, bytes] = OrderedDict()
+        self._drawn = lru_cache(_KEPT)(self._draw)
         self._streamer: TileStreamer | None = None
         self._renderer: NumbaRenderer | None = None
 
@@ -95,27 +95,23 @@ class TopTiles:
         if (centre + reach < low).any() or (centre - reach > high).any():
             return None
         with self._lock:
-            kept = self._kept.get(name)
-            if kept is not None:
-                self._kept.move_to_end(name)
-                return kept
-            view = render_top_view(
-                self._drawing(), centre, _SIDE_PX, name.side_m / _SIDE_PX,
-                float(self._cache.index.box_min[0, 2]),
-            )  # fmt: skip
-            bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
-            _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-            self._kept[name] = data.tobytes()
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-            return self._kept[name]
+            return self._drawn(name)
 
     def close(self) -> None:
         """End the loader; no tile may be asked for any more."""
         if self._streamer is not None:
             self._streamer.close()
 
-    def _drawing(self) -> NumbaRenderer:
+    def _draw(self, name: TileName) -> bytes:
+        frame, bottom = self._cache.frame, float(self._cache.index.box_min[0, 2])
+        centre = frame.enu_from_geodetic(*name.centre, frame.origin.height_m)[:2]
+        scale = name.side_m / _SIDE_PX
+        view = render_top_view(self._renderer_made(), centre, _SIDE_PX, scale, bottom)
+        bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
+        _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        return data.tobytes()
+
+    def _renderer_made(self) -> NumbaRenderer:
         if self._renderer is None:
             self._streamer = TileStreamer(self._cache, _MEMORY)
             self._renderer = NumbaRenderer(self._streamer, threads=1)

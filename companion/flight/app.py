@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from companion.config import CompanionConfig
+from companion.errors import CompanionError
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly, Component
 from companion.flight.feed import Feed
@@ -23,6 +24,7 @@ from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from companion.redaction import redacted
 from companion.supervision.pulse import Pulse
 from companion.supervision.restart import without_lost_disks
+from localizer.errors import LocalizerError
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack
 from mavlink_bridge.alerts.catalogue import alert
@@ -179,6 +181,34 @@ class Companion:
         if bridge is not None and self._lost_settings:
             bridge.report_alert(alert(AlertId.DEPLOYMENT_LOST))
             events.send("warning", f"flown as before the restart, since {self._lost_settings}")
+
+
+def released_companion(
+    config: CompanionConfig,
+    *,
+    standby: bool,
+    pulse: int | None,
+    restart: bool = False,
+    lost_settings: str = "",
+) -> Companion | None:
+    """The flight process, not yet running. A standby is prepared here, without link and feed, and
+    returned when a line comes on standard input, from the supervisor; None if the input ends
+    without one.
+    pulse, restart, lost_settings: see `Companion`. For a standby, restart is always true.
+    """
+    companion = Companion(
+        config, pulse=pulse, restart=restart or standby, lost_settings=lost_settings
+    )
+    if not standby:
+        return companion
+    try:
+        companion.prepare()
+    except (CompanionError, LocalizerError, OSError) as error:  # the flight will say so, then
+        _log.warning("standby is not warm: %s", error)
+    if sys.stdin.readline():
+        return companion
+    companion.discard_prepared()
+    return None
 
 
 def _log_event(level: str, text: str) -> None:

@@ -22,12 +22,12 @@ from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics, target_report
 from companion.errors import ConfigError
 from companion.flight.calibration_observer import CalibrationObserver
-from companion.flight.components import BuildContext, Component
+from companion.flight.components import Assembly, Component
 from companion.flight.feed import Feed
 from companion.flight.health import HealthInputs, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
-from companion.flight.priors import AutopilotPose, PriorSources, local_near
+from companion.flight.priors import AutopilotPose, local_near
 from companion.flight.reachable_region import ReachableRegion
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, enu_on_map
@@ -45,7 +45,7 @@ from companion.live.publisher import Publisher
 from companion.live.shown import ConsoleData, Instruments
 from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import readable_map_hash, require_pinned
-from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
+from companion.sources import FrameSource, PacketTap, StreamState, open_source
 from companion.sources.timing import system_minus_monotonic
 from companion.sources.zoom import ZoomedFrames
 from companion.targets.clicks import ClickPolicy
@@ -78,7 +78,7 @@ _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 _BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT)
 
 
-def _map(context: BuildContext) -> MapStack:
+def _map(context: Assembly) -> MapStack:
     config = context.config
     require_pinned(config.map, config.map_sha256)
     stack = MapStack(config.map, config.localizer)
@@ -90,13 +90,13 @@ def _map(context: BuildContext) -> MapStack:
     return stack
 
 
-def _extrinsics(context: BuildContext) -> CameraExtrinsics:
+def _extrinsics(context: Assembly) -> CameraExtrinsics:
     cache = context[MapStack].cache
     arm = np.array(context.config.camera.lever_arm_m)
     return CameraExtrinsics(cache.frame, cache.manifest.geoid_separation_m, arm)
 
 
-def _bridge(context: BuildContext) -> Bridge:
+def _bridge(context: Assembly) -> Bridge:
     search = context.later(PlaceSearch)
     bridge = Bridge(
         _bridge_config(context.config),
@@ -110,7 +110,7 @@ def _bridge(context: BuildContext) -> Bridge:
     return bridge
 
 
-def _record(context: BuildContext) -> RecordKeeper:
+def _record(context: Assembly) -> RecordKeeper:
     bridge, channels, config = context[Bridge], context.channels, context.config
 
     def incomplete(why: str) -> None:
@@ -145,7 +145,7 @@ def _record(context: BuildContext) -> RecordKeeper:
     return keeper
 
 
-def _source(context: BuildContext) -> FrameSource:
+def _source(context: Assembly) -> FrameSource:
     camera, events, bridge = context.config.camera, context.channels.events, context[Bridge]
 
     def on_state(state: StreamState, text: str) -> None:
@@ -156,19 +156,18 @@ def _source(context: BuildContext) -> FrameSource:
 
     model = camera.model.camera()
     wanted: tuple[PacketTap | None, ...] = (context.get(KlvRelay), context.get(FrameTimes))
-    taps = [tap for tap in wanted if tap is not None]
-    tap = PacketTaps(taps) if taps else None
-    return open_source(camera.source, model, camera.settings, on_state, on_stranger, tap)
+    taps = (tap for tap in wanted if tap is not None)
+    return open_source(camera.source, model, camera.settings, on_state, on_stranger, *taps)
 
 
-def _frame_times(context: BuildContext) -> FrameTimes:
+def _frame_times(context: Assembly) -> FrameTimes:
     targets = context.later(TargetReporter)
     times = FrameTimes(lambda detection: targets().add_detection(detection))
     context.channels.frames.subscribe(times.add_frame)
     return times
 
 
-def _klv(context: BuildContext) -> KlvRelay:
+def _klv(context: Assembly) -> KlvRelay:
     config, bridge, cache = context.config, context[Bridge], context[MapStack].cache
     assert config.klv is not None  # or the part is not wanted
     if not config.camera.is_video:
@@ -186,11 +185,11 @@ def _klv(context: BuildContext) -> KlvRelay:
     return relay
 
 
-def _health(context: BuildContext) -> HealthMonitor:
+def _health(context: Assembly) -> HealthMonitor:
     engine, keeper = context.later(DualThreadEngine), context[RecordKeeper]
     streamer = context[MapStack].streamer
     autopilot, search = context.later(AutopilotPose), context.later(PlaceSearch)
-    source = context[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+    source = context[FrameSource]
     inputs = HealthInputs(
         lambda: keeper.is_complete,
         lambda: autopilot().sigma_m,
@@ -212,7 +211,7 @@ def _health(context: BuildContext) -> HealthMonitor:
     return health
 
 
-def _targets(context: BuildContext) -> TargetReporter:
+def _targets(context: Assembly) -> TargetReporter:
     channels, bridge = context.channels, context[Bridge]
     cache, numbers = context[MapStack].cache, TargetNumbers()
     reporter = TargetReporter(
@@ -234,7 +233,7 @@ def _targets(context: BuildContext) -> TargetReporter:
     return reporter
 
 
-def _clicks(context: BuildContext) -> ClickPolicy:
+def _clicks(context: Assembly) -> ClickPolicy:
     report, config = context[Bridge].report_alert, context.config.targets
     clicks = ClickPolicy(context[TargetReporter], report, config)
     context.channels.estimates.subscribe(clicks.add_estimate)
@@ -243,13 +242,13 @@ def _clicks(context: BuildContext) -> ClickPolicy:
     return clicks
 
 
-def _detections(context: BuildContext) -> DetectionListener:
+def _detections(context: Assembly) -> DetectionListener:
     address = context.config.targets.detections
     assert address is not None  # or the part is not wanted
     return DetectionListener(address, context[FrameTimes].add_detection)
 
 
-def _detector(context: BuildContext) -> BoxDetector:
+def _detector(context: Assembly) -> BoxDetector:
     channels, reporter = context.channels, context[TargetReporter]
     config = context.config.targets.detector
     assert config is not None  # or the part is not wanted
@@ -260,7 +259,7 @@ def _detector(context: BuildContext) -> BoxDetector:
     return detector
 
 
-def _target_counts(context: BuildContext) -> Callable[[], dict[str, int]]:
+def _target_counts(context: Assembly) -> Callable[[], dict[str, int]]:
     """A function that counts clicks and detections without a position, for health and report."""
     targets, times = context.later(TargetReporter), context.get(FrameTimes)
     has_detector = context.config.targets.detector is not None
@@ -279,7 +278,7 @@ def _target_counts(context: BuildContext) -> Callable[[], dict[str, int]]:
     return counts
 
 
-def _view(context: BuildContext) -> ViewReporter:
+def _view(context: Assembly) -> ViewReporter:
     cache, bridge = context[MapStack].cache, context[Bridge]
     rate_hz = context.config.bridge.targets.rate_hz
     view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.report_view)
@@ -287,13 +286,13 @@ def _view(context: BuildContext) -> ViewReporter:
     return view
 
 
-def _vital_signs(context: BuildContext) -> VitalSigns:
+def _vital_signs(context: Assembly) -> VitalSigns:
     signs = VitalSigns(context[Bridge].send_named_values)
     context.channels.estimates.subscribe(lambda estimate, _: signs.add_estimate(estimate))
     return signs
 
 
-def _autopilot(context: BuildContext) -> AutopilotPose:
+def _autopilot(context: Assembly) -> AutopilotPose:
     bridge = context[Bridge]
     autopilot = AutopilotPose(bridge, context[CameraExtrinsics], lambda: bridge.on_gnss)
     context.channels.estimates.subscribe(
@@ -302,7 +301,7 @@ def _autopilot(context: BuildContext) -> AutopilotPose:
     return autopilot
 
 
-def _last_fix(context: BuildContext) -> FixMemory:
+def _last_fix(context: Assembly) -> FixMemory:
     config, bridge = context.config, context[Bridge]
     integrity_monitor = context.get(IntegrityMonitor)
     folder = config.state_folder
@@ -318,7 +317,7 @@ def _last_fix(context: BuildContext) -> FixMemory:
     return memory
 
 
-def _localizer(context: BuildContext) -> Localizer:
+def _localizer(context: Assembly) -> Localizer:
     _log.info("making the localizer ready; the first start on a machine compiles its kernels")
     config, autopilot = context.config, context.later(AutopilotPose)
     camera = config.camera.model.camera()
@@ -334,13 +333,13 @@ def _localizer(context: BuildContext) -> Localizer:
     return build_localizer(context[MapStack], camera, settings, sensors)
 
 
-def _injection(context: BuildContext) -> FixInjection:
+def _injection(context: Assembly) -> FixInjection:
     injection = FixInjection(context[Bridge], context[CameraExtrinsics])
     context.channels.estimates.subscribe(injection.add_estimate)
     return injection
 
 
-def _map_shift(context: BuildContext) -> MapOffsetEstimator:
+def _map_shift(context: Assembly) -> MapOffsetEstimator:
     injection = context.config.bridge.injection
     shift = MapOffsetEstimator(
         context[Bridge],
@@ -352,7 +351,7 @@ def _map_shift(context: BuildContext) -> MapOffsetEstimator:
     return shift
 
 
-def _integrity_monitor(context: BuildContext) -> IntegrityMonitor:
+def _integrity_monitor(context: Assembly) -> IntegrityMonitor:
     config, injection = context.config, context.config.bridge.injection
     limits = IntegrityLimits(
         injection.alert_limit_m,
@@ -376,12 +375,11 @@ def _integrity_monitor(context: BuildContext) -> IntegrityMonitor:
     return integrity_monitor
 
 
-def _feed(context: BuildContext) -> Feed:
-    source = context[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
-    return Feed(source, context.channels.frames.send)
+def _feed(context: Assembly) -> Feed:
+    return Feed(context[FrameSource], context.channels.frames.send)
 
 
-def _console(context: BuildContext) -> Publisher:
+def _console(context: Assembly) -> Publisher:
     """Build the console's server. It only reads from the flight. It subscribes last and keeps
     references to frames, no copies.
     """
@@ -440,7 +438,7 @@ def _console(context: BuildContext) -> Publisher:
     return publisher
 
 
-def _search(context: BuildContext) -> PlaceSearch:
+def _search(context: Assembly) -> PlaceSearch:
     cache, channels, reach = (
         context[MapStack].cache,
         context.channels,
@@ -453,12 +451,12 @@ def _search(context: BuildContext) -> PlaceSearch:
     )
 
 
-def _engine(context: BuildContext) -> DualThreadEngine:
-    channels = context.channels
+def _engine(context: Assembly) -> DualThreadEngine:
+    channels, memory, autopilot = context.channels, context[FixMemory], context[AutopilotPose]
     engine = DualThreadEngine(
         context[Localizer],
         (channels.estimates.send,),
-        context[PriorSources].at,
+        lambda time_ns: memory.prior(time_ns) or autopilot.prior(time_ns),
         context[PlaceSearch].search,
     )
     table, bridge = context.config.camera.zoom, context[Bridge]
@@ -466,7 +464,13 @@ def _engine(context: BuildContext) -> DualThreadEngine:
         channels.frames.subscribe(engine.submit)
         return engine
     zoomed = ZoomedFrames(table, bridge.zoom_at, bridge.report_alert)
-    channels.frames.subscribe(zoomed.zoom_filter(engine.submit))
+
+    def submit(frame: Frame) -> None:
+        known = zoomed(frame)
+        if known is not None:
+            engine.submit(known)
+
+    channels.frames.subscribe(submit)
     channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))
     return engine
 
@@ -477,101 +481,74 @@ def _engine(context: BuildContext) -> DualThreadEngine:
 # record is closed after all that could tell it something.
 COMPONENTS: tuple[Component[Any], ...] = (
     Component("map", MapStack, _map, close=MapStack.close, ahead=True),
-    Component("installation", CameraExtrinsics, _extrinsics, depends=(MapStack,)),
+    Component("installation", CameraExtrinsics, _extrinsics),
     Component(
-        "bridge", Bridge, _bridge, depends=(MapStack,), later=(PlaceSearch,),
+        "bridge", Bridge, _bridge,
         start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
         hand_over=Bridge.hand_over,
     ),
     Component("IMU", InertialTrack, lambda _: InertialTrack()),
-    Component("injection", FixInjection, _injection, depends=(Bridge, CameraExtrinsics)),
-    Component("map shift", MapOffsetEstimator, _map_shift, depends=(Bridge, FixInjection)),
+    Component("injection", FixInjection, _injection),
+    Component("map shift", MapOffsetEstimator, _map_shift),
     Component(
         "integrity monitor", IntegrityMonitor, _integrity_monitor,
-        depends=(Bridge, CameraExtrinsics, FixInjection, InertialTrack),
         start=IntegrityMonitor.start, stop=IntegrityMonitor.stop, close=IntegrityMonitor.close,
         hand_over=IntegrityMonitor.hand_over,
         wanted=lambda config: config.integrity_monitor.enabled,
     ),
+    Component("record", RecordKeeper, _record, start=RecordKeeper.link, close=RecordKeeper.close),
     Component(
-        "record", RecordKeeper, _record, depends=(MapStack, Bridge, IntegrityMonitor),
-        start=RecordKeeper.link,
-        close=RecordKeeper.close,
-    ),
-    Component(
-        "klv", KlvRelay, _klv, depends=(MapStack, Bridge), start=KlvRelay.start, stop=KlvRelay.stop,
+        "klv", KlvRelay, _klv, start=KlvRelay.start, stop=KlvRelay.stop,
         wanted=lambda config: config.klv is not None,
     ),
     Component(
-        "frame times", FrameTimes, _frame_times, later=(TargetReporter,),
+        "frame times", FrameTimes, _frame_times,
         wanted=lambda config: config.targets.detections is not None,
     ),
-    Component("source", FrameSource, _source, depends=(Bridge, KlvRelay, FrameTimes)),
+    Component("source", FrameSource, _source),
     Component(
-        "health", HealthMonitor, _health,
-        depends=(
-            MapStack, Bridge, MapOffsetEstimator, RecordKeeper, FrameSource, IntegrityMonitor,
-            FrameTimes,
-        ),
-        later=(DualThreadEngine, AutopilotPose, TargetReporter, BoxDetector, PlaceSearch),
-        start=HealthMonitor.start, stop=HealthMonitor.stop,
+        "health", HealthMonitor, _health, start=HealthMonitor.start, stop=HealthMonitor.stop
     ),
     Component(
-        "targets", TargetReporter, _targets, depends=(MapStack, Bridge),
-        start=TargetReporter.start, stop=TargetReporter.stop,
+        "targets", TargetReporter, _targets, start=TargetReporter.start, stop=TargetReporter.stop
     ),
-    Component("clicks", ClickPolicy, _clicks, depends=(TargetReporter, Bridge)),
+    Component("clicks", ClickPolicy, _clicks),
     Component(
-        "detections", DetectionListener, _detections, depends=(FrameTimes,),
-        close=DetectionListener.close, wanted=lambda config: config.targets.detections is not None,
+        "detections", DetectionListener, _detections, close=DetectionListener.close,
+        wanted=lambda config: config.targets.detections is not None,
     ),
     Component(
-        "detector", BoxDetector, _detector, depends=(MapStack, TargetReporter, Bridge),
-        start=BoxDetector.start, stop=BoxDetector.stop,
+        "detector", BoxDetector, _detector, start=BoxDetector.start, stop=BoxDetector.stop,
         wanted=lambda config: config.targets.detector is not None,
     ),
-    Component("autopilot", AutopilotPose, _autopilot, depends=(Bridge, CameraExtrinsics)),
+    Component("autopilot", AutopilotPose, _autopilot),
     Component(
         "last fix", FixMemory, _last_fix,
-        depends=(Bridge, CameraExtrinsics, IntegrityMonitor, AutopilotPose),
         start=FixMemory.start, stop=FixMemory.stop, hand_over=FixMemory.hand_over,
     ),
+    Component("localizer", Localizer, _localizer, ahead=True),
     Component(
-        "priors", PriorSources,
-        lambda context: PriorSources(context[FixMemory].prior, context[AutopilotPose].prior),
-        depends=(FixMemory, AutopilotPose),
-    ),
-    Component(
-        "localizer", Localizer, _localizer, depends=(MapStack,), later=(AutopilotPose,), ahead=True
-    ),
-    Component(
-        "view", ViewReporter, _view, depends=(MapStack, Bridge),
-        start=ViewReporter.start, stop=ViewReporter.stop,
+        "view", ViewReporter, _view, start=ViewReporter.start, stop=ViewReporter.stop,
         wanted=lambda config: config.bridge.camera.announce or config.bridge.targets.cot_aircraft,
     ),
     Component(
-        "vital signs", VitalSigns, _vital_signs, depends=(Bridge,),
-        start=VitalSigns.start, stop=VitalSigns.stop,
+        "vital signs", VitalSigns, _vital_signs, start=VitalSigns.start, stop=VitalSigns.stop,
         wanted=lambda config: config.bridge.named_values,
     ),
     Component(
-        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose, Bridge, InertialTrack),
+        "search", PlaceSearch, _search,
         start=PlaceSearch.start, stop=PlaceSearch.stop, close=PlaceSearch.close,
     ),
     Component(
         "console", Publisher, _console,
-        depends=(MapStack, Bridge, HealthMonitor, RecordKeeper, PlaceSearch),
         start=Publisher.start, stop=Publisher.stop, close=Publisher.close,
         wanted=lambda config: config.console is not None,
     ),
     Component(
         "engine", DualThreadEngine, _engine,
-        depends=(Localizer, PriorSources, PlaceSearch, Bridge),
         start=DualThreadEngine.start, stop=DualThreadEngine.stop,
     ),
-    Component(
-        "feed", Feed, _feed, depends=(FrameSource,), start=Feed.start, stop=Feed.stop
-    ),
+    Component("feed", Feed, _feed, start=Feed.start, stop=Feed.stop),
 )  # fmt: skip
 
 

@@ -35,40 +35,23 @@ def is_for_injection(estimate: PoseEstimate) -> bool:
     return estimate.accepted and estimate.state in _INJECTED
 
 
-class JumpCounter:
-    """Counts the jumps of the estimate (`VisionFix.reset_count`), so that the EKF resets to the new
-    position.
-
-    A jump is each start after LOST, also the first. A registration after BRIDGING is a jump, too,
-    because it corrects the drift. DEGRADED causes no jump. count: jumps so far, from 1.
-    """
-
-    def __init__(self) -> None:
-        self.count = 1
-        self._state = TrackingState.INITIALIZING
-
-    def add_state(self, state: TrackingState) -> None:
-        """Add the tracking state of the next frame, in order. `count` grows by one when the
-        position is lost, and when the map matches again after BRIDGING.
-        """
-        before, self._state = self._state, state
-        is_lost = state is TrackingState.LOST and before is not TrackingState.LOST
-        found_again = before is TrackingState.BRIDGING and state is TrackingState.TRACKING
-        self.count += is_lost or found_again
-
-
 class FixInjection:
     """Converts each accepted estimate to a fix, has it checked, and passes it to the bridge.
 
     It runs on the localization thread. The conversion takes 0.12 ms in the median (two geodetic
     conversions and two rotations, no access to the map). To wake another thread would take as long
     and make the fix older.
+
+    It counts the jumps of the estimate (`VisionFix.reset_count`, from 1), so that the EKF resets to
+    the new position. A jump is each start after LOST, also the first. A registration after BRIDGING
+    is a jump, too, because it corrects the drift. DEGRADED causes no jump.
     """
 
     def __init__(self, bridge: Bridge, extrinsics: CameraExtrinsics) -> None:
         self._bridge = bridge
         self._extrinsics = extrinsics
-        self._jumps = JumpCounter()
+        self._jumps = 1
+        self._state = TrackingState.INITIALIZING
         self._observers: tuple[Observer, ...] = ()
         self._checks: tuple[FixCheck, ...] = ()
         self._checks_failed = AlertDebouncer(CATALOGUE[AlertId.FIXES_NOT_CHECKED])
@@ -86,7 +69,10 @@ class FixInjection:
         accepted ones, TRACKING or BRIDGING, only count as jumps. Waits only for checks and
         observers, for 1 s at most if the integrity monitor is busy.
         """
-        self._jumps.add_state(estimate.state)
+        before, self._state = self._state, estimate.state
+        is_lost = self._state is TrackingState.LOST and before is not TrackingState.LOST
+        found_again = before is TrackingState.BRIDGING and self._state is TrackingState.TRACKING
+        self._jumps += is_lost or found_again
         if not is_for_injection(estimate):
             return
         time_ns = estimate.exposure_time_ns
@@ -95,7 +81,7 @@ class FixInjection:
             self._extrinsics,
             self._bridge.attitude_at(time_ns),
             self._bridge.gimbal_at(time_ns),
-            self._jumps.count,
+            self._jumps,
         )
         checked = self._checked(estimate, fix)
         if checked is not None:

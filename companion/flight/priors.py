@@ -14,15 +14,13 @@ from typing import Protocol
 import numpy as np
 
 from companion.conversions import CameraExtrinsics, camera_rotation, vehicle_prior
-from companion.inertial import AttitudeTelemetry
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.sensors.error_model import SENSORS
-from localizer.tracking.engine import PriorProvider
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.injection.shadow import gnss_healthy
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.origin import north_east
 
 _CONST_POSITION = 128  # EKF_CONST_POS_MODE of EKF_STATUS_REPORT (193): it only knows that it is
@@ -38,8 +36,20 @@ _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
 _BESIDE_M, _REPORT_S = 3.0, 0.5  # of the receiver: an EKF farther off follows something else
 
 
-class AutopilotSource(AttitudeTelemetry, Protocol):
-    """Telemetry that the priors read."""
+class AutopilotSource(Protocol):
+    """Telemetry that the priors read: from the bridge in flight, from a record afterwards."""
+
+    def state(self) -> VehicleState:
+        """Newest state of the vehicle."""
+        ...
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """The vehicle's attitude at a CLOCK_MONOTONIC time; None if unknown."""
+        ...
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a CLOCK_MONOTONIC time; None if unknown."""
+        ...
 
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's position (north, east, down) from its origin, m, at a CLOCK_MONOTONIC time;
@@ -253,18 +263,3 @@ class AutopilotPose:
         known = self._on_gnss()
         on_gnss = _is_beside_receiver(state) if known is None else known
         return self.belief.at(state, now_ns, on_gnss=on_gnss)
-
-
-class PriorSources:
-    """Ordered sources of a pose prior; the first that has one is used."""
-
-    def __init__(self, *sources: PriorProvider) -> None:
-        self._sources = sources
-
-    def at(self, time_ns: int) -> PosePrior | None:
-        """A prior for that CLOCK_MONOTONIC time; None if no source has one."""
-        for source in self._sources:
-            prior = source(time_ns)
-            if prior is not None:
-                return prior
-        return None

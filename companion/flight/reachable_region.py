@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from companion.inertial import InertialDisplacement, InertialTrack, VehicleTelemetry
+from companion.inertial import InertialDisplacement, InertialTrack
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.relocalization.types import SearchRegion
 from localizer.sensors.error_model import SENSORS
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
+from mavlink_bridge.bridge import Bridge
 
 _SIGMAS = 3.0
 _LEAST_M = 15.0  # candidates of the search are metres off themselves
@@ -46,7 +47,7 @@ class ReachableRegion:
     second, `region` on the search thread.
     """
 
-    def __init__(self, vehicle: VehicleTelemetry, track: InertialTrack) -> None:
+    def __init__(self, vehicle: Bridge, track: InertialTrack) -> None:
         self._vehicle, self._track = vehicle, track
         self._lock = threading.Lock()
         self._seen: _ConfirmedPosition | None = None

@@ -56,17 +56,6 @@ Event = Callable[[str, str], None]
 
 
 @dataclass(frozen=True)
-class Hint:
-    """The operator's approximate position: east and north in the map's frame, metres;
-    CLOCK_MONOTONIC.
-    """
-
-    centre: tuple[float, float]
-    radius_m: float
-    time_s: float
-
-
-@dataclass(frozen=True)
 class RelocalizationHypothesis:
     """Result of a search that took too long, for a second search near it.
 
@@ -180,7 +169,7 @@ class PlaceSearch:
         self._cache, self._config = cache, config
         self._autopilot, self._event, self._reach = autopilot, event, reachable
         self._in_reach = 0  # searches since the whole map was searched
-        self._hint: Hint | None = None
+        self._hint: tuple[SearchRegion, float] | None = None  # the operator's, and when it came
         self._open: OpenRelocalizer | None = None
         self._obstacle: AlertId | None = AlertId.SEARCH_NOT_READY
         self._without_pose_s = -math.inf  # when attitude or height was missing last
@@ -216,7 +205,8 @@ class PlaceSearch:
         """Set the operator's position (map frame): for 120 s searches look within radius_m of it.
         It is never a fix.
         """
-        self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
+        region = SearchRegion.circle(np.array([east_m, north_m]), radius_m)
+        self._hint = region, time.monotonic()
 
     def hint_at(self, hint: PlaceHint) -> bool:
         """As `hint`, for a position in WGS84 and twice its radius, and log it. False and nothing
@@ -287,9 +277,10 @@ class PlaceSearch:
         """Search region: the operator's position, else that of the autopilot, else the reachable
         region. None: the whole map, in every fifth call that has to use the reachable region.
         """
-        hint = self._hint
-        if hint is not None and time.monotonic() - hint.time_s < _HINT_S:
-            return SearchRegion.circle(np.array(hint.centre), hint.radius_m)
+        if self._hint is not None:
+            region, time_s = self._hint
+            if time.monotonic() - time_s < _HINT_S:
+                return region
         prior = self._autopilot.prior(time_ns)
         if prior is None:
             self._in_reach = (self._in_reach + 1) % _WHOLE_MAP_EVERY

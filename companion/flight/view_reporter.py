@@ -10,6 +10,7 @@ from companion.conversions import camera_view
 from companion.ending import wait_for_end
 from localizer.geometry.geo import LocalFrame
 from localizer.targets.locate import RayCaster
+from localizer.tracking.mailbox import Mailbox
 from localizer.types import PoseEstimate
 from mavlink_bridge.messages import CameraView
 
@@ -33,8 +34,7 @@ class ViewReporter:
         self._frame = frame
         self._cast = cast
         self._look = look
-        self._newest: PoseEstimate | None = None
-        self._came = threading.Event()
+        self._newest: Mailbox[PoseEstimate] = Mailbox()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
 
@@ -45,23 +45,18 @@ class ViewReporter:
     def stop(self) -> None:
         """Stop the thread."""
         self._stop.set()
-        self._came.set()
+        self._newest.close()
         wait_for_end(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Set the estimate to report next; ignored unless accepted. Never blocks."""
         if estimate.accepted:
-            self._newest = estimate
-            self._came.set()
+            self._newest.put(estimate)
 
     def _run(self) -> None:
-        while not self._stop.wait(self._period_s):
-            self._came.wait()
-            self._came.clear()
-            estimate = self._newest
-            if estimate is None or self._stop.is_set():
-                continue
+        while (estimate := self._newest.take()) is not None:
             try:
                 self._look(camera_view(estimate, self._frame, self._cast))
             except Exception:  # telemetry must not end the flight
                 _log.exception("the camera's view could not be reported")
+            self._stop.wait(self._period_s)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,12 +11,12 @@ import numpy as np
 from companion.calibration_watch.ground import GroundView
 from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
 from companion.calibration_watch.watch import BORESIGHT_DEG, FOCAL_SHARE, TIME_S, CalibrationWatch
-from companion.inertial import InertialTrack, VehicleTelemetry
+from companion.inertial import InertialTrack
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import ActiveAlerts, AlertDebouncer, CheckResult
 from companion.integrity_monitor.ekf import EkfWatch
 from companion.integrity_monitor.jump import JumpCheck
-from companion.integrity_monitor.motion import MotionCheck, MotionVerdict
+from companion.integrity_monitor.motion import CALM_SHARE, MotionCheck, MotionVerdict
 from companion.integrity_monitor.position_checks import GnssCheck, HeightCheck
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
 from companion.integrity_monitor.scale import ScaleCheck
@@ -35,6 +34,7 @@ from mavlink_bridge.alerts.alert import Alert, Inhibits, OutputAction
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.integrity import INTEGRITY
 from mavlink_bridge.alerts.words import CalibrationError
+from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _AIRBORNE_M = 3.0
@@ -48,8 +48,6 @@ _SHOWS_GRAY = 2.0  # contrast below which a picture shows nothing, gray levels o
 _WAITS_NS = 500_000_000  # for the IMU's record to reach a fix
 _FRESH_NS = 1_000_000_000
 _PICTURE_FRESH_NS = 2_000_000_000
-_CALM_SHARE = 0.5  # of a motion limit, below which vision agrees with the IMU
-_MOVES_S = 5.0  # a position that stood still for less moves
 _OLD_NS = 2_000_000_000  # of a velocity, which comes ten times a second
 _BACKWARDS = 5  # pictures or fixes in a row whose stamps do not advance
 _QUEUE = 256
@@ -193,7 +191,7 @@ class IntegrityChecks:
         """
         self._tilt.add(fix, attitude)
         verdict = self._verdict
-        agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
+        agrees = verdict is None or not verdict.settled or verdict.share < CALM_SHARE
         admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
         self._update_steps(fix, state, admitted=admitted)
         height_m = self._ground.height_m(state, fix.time_ns)
@@ -224,7 +222,7 @@ class IntegrityChecks:
         resets = fix.reset_count + self._wrong
         return replace(fix, reset_count=resets, position_covariance_ned=covariance)
 
-    def step(self, now_ns: int, vehicle: VehicleTelemetry) -> list[Alert]:
+    def step(self, now_ns: int, vehicle: Bridge) -> list[Alert]:
         """Run all checks, a few times a second; returns the alerts to report, raised or cleared."""
         state = vehicle.state()
         self._track.follow(vehicle)
@@ -283,44 +281,33 @@ class IntegrityChecks:
         height = state.altitude_relative_m
         # It may fly below its take-off height, from a hill.
         flies = state.armed and (height is None or abs(height) >= _AIRBORNE_M)
-        none = CheckResult(None)
-        checks: dict[AlertId, Callable[[], CheckResult]] = {
-            AlertId.VIDEO_FROZEN: lambda: (
-                self._frozen(now_ns, state) if flies else CheckResult(False)
-            ),
-            AlertId.LOW_CONTRAST: lambda: (
-                self._low_contrast(now_ns) if flies else CheckResult(False)
-            ),
-            AlertId.VIDEO_REPEATS: lambda: self._repeats(now_ns) if flies else CheckResult(False),
-            AlertId.VISION_IMU_MISMATCH: lambda: self._moves_otherwise() if fresh else none,
-            AlertId.HEIGHT_MISMATCH: lambda: self._height_reading if fresh else none,
-            AlertId.POSITION_JUMP: lambda: CheckResult(self._jump_held, self._jumps.distance_m),
-            AlertId.POSITION_STEP: lambda: CheckResult(
-                self._steps.metres > 0.0, self._steps.metres
-            ),
-            AlertId.TILT_MISMATCH: lambda: self._tilt_mismatch() if fresh else none,
-            AlertId.GNSS_VISION_MISMATCH: lambda: (
-                self._gnss_mismatch(state, now_ns) if fresh else none
-            ),
-            AlertId.EKF_REJECTS_VISION: lambda: (
-                self._ekf.check_rejection(state) if fresh else CheckResult(False)
-            ),
-            AlertId.EKF_JUMP: lambda: self._ekf_jump(state, now_ns),
-            AlertId.VIDEO_TIMESTAMPS: lambda: CheckResult(self._backwards >= _BACKWARDS),
-            AlertId.HPL_OVER_LIMIT: lambda: self._level_over_limit() if fresh else none,
-            **self._calibration_checks(),
+        none, good = CheckResult(None), CheckResult(False)
+        return {
+            AlertId.VIDEO_FROZEN: self._frozen(now_ns, state) if flies else good,
+            AlertId.LOW_CONTRAST: self._low_contrast(now_ns) if flies else good,
+            AlertId.VIDEO_REPEATS: self._repeats(now_ns) if flies else good,
+            AlertId.VISION_IMU_MISMATCH: self._moves_otherwise() if fresh else none,
+            AlertId.HEIGHT_MISMATCH: self._height_reading if fresh else none,
+            AlertId.POSITION_JUMP: CheckResult(self._jump_held, self._jumps.distance_m),
+            AlertId.POSITION_STEP: CheckResult(self._steps.metres > 0.0, self._steps.metres),
+            AlertId.TILT_MISMATCH: self._tilt_mismatch() if fresh else none,
+            AlertId.GNSS_VISION_MISMATCH: self._gnss_mismatch(state, now_ns) if fresh else none,
+            AlertId.EKF_REJECTS_VISION: self._ekf.check_rejection(state) if fresh else good,
+            AlertId.EKF_JUMP: self._ekf_jump(state, now_ns),
+            AlertId.VIDEO_TIMESTAMPS: CheckResult(self._backwards >= _BACKWARDS),
+            AlertId.HPL_OVER_LIMIT: self._level_over_limit() if fresh else none,
+            **self._calibration_results(),
         }
-        return {of: check() for of, check in checks.items()}
 
-    def _calibration_checks(self) -> dict[AlertId, Callable[[], CheckResult]]:
+    def _calibration_results(self) -> dict[AlertId, CheckResult]:
         known = self._calibration.figures()
         share, late = known.focal, known.late_s
         long = CalibrationError.LONG if share.value > 0.0 else CalibrationError.SHORT
         when = CalibrationError.LATE if late.value > 0.0 else CalibrationError.EARLY
         return {
-            AlertId.FOCAL_LENGTH: lambda: _beyond(share, FOCAL_SHARE, 100.0, long),
-            AlertId.BORESIGHT: lambda: _beyond(known.boresight_deg, BORESIGHT_DEG, 1.0, known.axis),
-            AlertId.TIME_OFFSET: lambda: _beyond(late, TIME_S, 1e3, when),
+            AlertId.FOCAL_LENGTH: _beyond(share, FOCAL_SHARE, 100.0, long),
+            AlertId.BORESIGHT: _beyond(known.boresight_deg, BORESIGHT_DEG, 1.0, known.axis),
+            AlertId.TIME_OFFSET: _beyond(late, TIME_S, 1e3, when),
         }
 
     def _estimated_error_m(self, state: VehicleState, height_m: float | None) -> float:
@@ -335,24 +322,28 @@ class IntegrityChecks:
         # Late stamps are how a step is explained, and a tilt shifts as a step does.
         return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(height_m))
 
-    def _frozen(self, now_ns: int, state: VehicleState) -> CheckResult:
+    def _fresh_verdict(self, now_ns: int) -> FrameVerdict | None:
+        """Of the newest frame; None for an old one, since a feed that ended is reported as such."""
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
-            return CheckResult(None)  # a feed that ended is reported as such
-        verdict = self._picture[1]
+            return None
+        return self._picture[1]
+
+    def _frozen(self, now_ns: int, state: VehicleState) -> CheckResult:
+        verdict = self._fresh_verdict(now_ns)
+        if verdict is None:
+            return CheckResult(None)
         if verdict.contrast < _SHOWS_GRAY:
-            return CheckResult(
-                False
-            )  # fog, a covered lens: the localizer says that it sees nothing
+            return CheckResult(False)  # fog, a covered lens: the localizer says it sees nothing
         identical = verdict.identical_s >= _IDENTICAL_S
         still = verdict.still_s >= self._still_s(now_ns, state)
         still = still or self._should_have_moved(state, verdict)
         return CheckResult(identical or still, verdict.still_s)
 
     def _low_contrast(self, now_ns: int) -> CheckResult:
-        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+        verdict = self._fresh_verdict(now_ns)
+        if verdict is None:
             return CheckResult(None)
-        shown = self._picture[1].detail
-        return CheckResult(shown < LOW_DETAIL, shown)
+        return CheckResult(verdict.detail < LOW_DETAIL, verdict.detail)
 
     @staticmethod
     def _should_have_moved(state: VehicleState, verdict: FrameVerdict) -> bool:
@@ -371,10 +362,10 @@ class IntegrityChecks:
         return max(_STILL_S, _STILL_FIRST_S + _STILL_PER_M * ground_m)
 
     def _repeats(self, now_ns: int) -> CheckResult:
-        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+        verdict = self._fresh_verdict(now_ns)
+        if verdict is None:
             return CheckResult(None)
-        lag_s = self._picture[1].repeat_lag_s
-        return CheckResult(lag_s > 0.0, lag_s)
+        return CheckResult(verdict.repeat_lag_s > 0.0, verdict.repeat_lag_s)
 
     def _moves_otherwise(self) -> CheckResult:
         verdict = self._verdict
@@ -383,8 +374,7 @@ class IntegrityChecks:
         if not self._debouncers[AlertId.VISION_IMU_MISMATCH].raised:
             return CheckResult(verdict.share > 1.0, verdict.deviation_m)
         # A filter follows even a frozen position in the end: it must move before it is believed.
-        calm = verdict.share < _CALM_SHARE and verdict.still_s < _MOVES_S
-        return CheckResult(not calm, verdict.deviation_m)
+        return CheckResult(not verdict.agrees, verdict.deviation_m)
 
     def _gnss_mismatch(self, state: VehicleState, now_ns: int) -> CheckResult:
         if self._newest is None or self._level is None or self._limits.gnss_is_ours:
@@ -396,14 +386,10 @@ class IntegrityChecks:
 
     def _ekf_jump(self, state: VehicleState, now_ns: int) -> CheckResult:
         verdict = self._verdict
-        agrees = (
-            verdict is not None
-            and verdict.settled
-            and verdict.share < _CALM_SHARE
-            and verdict.still_s < _MOVES_S
-            and self.action is OutputAction.NONE
+        agrees = verdict is not None and verdict.settled and verdict.agrees
+        return self._ekf.check_jump(
+            state, now_ns, agrees=agrees and self.action is OutputAction.NONE
         )
-        return self._ekf.check_jump(state, now_ns, agrees=agrees)
 
     def _level_over_limit(self) -> CheckResult:
         if self._level is None:

@@ -36,6 +36,8 @@ _GAP_S = 3.0  # without fixes, after which the prediction restarts
 _SETTLE_S = 5.0  # until velocity and bias are known
 _BLOCK_S = 1.0
 _LEAST_FIXES = 3  # of a window
+CALM_SHARE = 0.5  # of a motion limit, below which vision agrees with the IMU
+_MOVES_S = 5.0  # a position that stood still for less moves
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class MotionVerdict:
     share: float
     deviation_m: float
     still_s: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether vision moves, and as the IMU does."""
+        return self.share < CALM_SHARE and self.still_s < _MOVES_S
 
 
 class MotionCheck:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from mavlink_bridge.config import StrictModel
 
 
-class ConsoleConfig(BaseModel):
+class ConsoleConfig(StrictModel):
     """Settings of the console: address of the operator's page, and its rights."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     listen: str = Field(
         "127.0.0.1:8080",

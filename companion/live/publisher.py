@@ -14,11 +14,11 @@ import socket
 import threading
 import time
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from companion.live.orders import OrderError, Orders
-from companion.live.pace import RateLimiter
 from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, encode
 from companion.live.shared import SharedMemory
 from companion.live.shown import ConsoleData, ConsoleFrame
@@ -28,6 +28,24 @@ _MOST_CONSOLES = 3
 _STATE_S = 0.5
 _PAUSE_S = 1.0  # after a failure, which may last: nothing is tried more often
 _ANSWERS = 8
+
+
+@dataclass
+class RateLimiter:
+    """Limits the mean rate: the next event is due a period after the last was due, not after it was
+    sent. Otherwise 10 Hz frames limited to 6 Hz would be sent every 200 ms, at 5 Hz.
+    """
+
+    period_s: float
+    due_s: float = 0.0
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether an event may be sent now; CLOCK_MONOTONIC in s."""
+        return now_s >= self.due_s
+
+    def mark_sent(self, now_s: float) -> None:
+        """Note that an event was sent; the next is due one period after this one was due."""
+        self.due_s = max(self.due_s + self.period_s, now_s)
 
 
 class _Console:

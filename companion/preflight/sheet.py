@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import CompanionConfig
-from companion.errors import ConfigError, ReportError
-from companion.preflight.map_pin import map_hash
+from companion.errors import ReportError
+from companion.preflight.map_pin import readable_map_hash
 from companion.versions import versions
 from companion.writing import write_result
 from localizer.errors import LocalizerError
@@ -152,7 +152,7 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
     bad = [str(leg.get("name")) for leg in legs if not leg.get("holds")]
     conditions = ", ".join(map(str, data.get("conditions", ())))
     mission = Path(str(data.get("mission", "a mission without a name"))).name
-    if data.get("map_sha256") != _hash(flown):
+    if data.get("map_sha256") != (readable_map_hash(flown) or "no map"):
         return SheetRow("forecast", f"{mission}: made over another map than {flown}", False)
     if data["holds"] and not bad:
         text = f"{mission}: vision should work on all {len(legs)} legs ({conditions})"
@@ -162,13 +162,6 @@ def _forecast(plan: Path | None, flown: Path) -> SheetRow:
         f"{', '.join(bad)}"
     )
     return SheetRow("forecast", text, False)
-
-
-def _hash(cache: Path) -> str:
-    try:
-        return map_hash(cache)
-    except ConfigError:
-        return "no map"
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from companion.sources.av_source import LiveVideoSource, VideoFileSource
 from companion.sources.base import (
     FrameSource,
     PacketTap,
-    PacketTaps,
     SourceCounters,
     SourceSettings,
     StateCallback,
@@ -24,7 +23,6 @@ __all__ = [
     "FrameSource",
     "LiveVideoSource",
     "PacketTap",
-    "PacketTaps",
     "SourceCounters",
     "SourceSettings",
     "StateCallback",
@@ -42,7 +40,7 @@ def open_source(
     settings: SourceSettings | None = None,
     on_state: StateCallback | None = None,
     on_stranger: Callable[[str], None] | None = None,
-    tap: PacketTap | None = None,
+    *taps: PacketTap,
 ) -> FrameSource:
     """Open the feed at `location`: ``udp://host:port`` (MPEG-TS, RTP or raw H.264 or H.265), the
     ``.sdp`` file of an RTP feed, ``rtsp://...``, ``/dev/videoN`` (or ``v4l2:///dev/videoN``), a
@@ -50,12 +48,12 @@ def open_source(
 
     camera: calibrated model of the feed's frames. on_state: called with the state and a text for
     the operator when the state changes. on_stranger: called once for each other IP address that
-    sends video to a UDP feed. tap: receives the packets of a video; unused for a folder of images.
+    sends video to a UDP feed. taps: receive the packets of a video; unused for a folder of images.
     Raises `StreamOpenError` if a file or device does not exist. A live stream may start later.
     """
     text = str(location)
     if text.startswith(_LIVE) or text.endswith(".sdp"):
-        return LiveVideoSource(text, camera, settings, on_state, on_stranger, tap)
+        return LiveVideoSource(text, camera, settings, on_state, on_stranger, *taps)
     if "://" in text:
         raise StreamOpenError(
             f"{text}: unknown kind of source; use udp://, rtsp://, /dev/videoN, a file (.sdp of an "
@@ -65,5 +63,5 @@ def open_source(
     if path.is_dir():
         return FolderSource(path, camera, settings, on_state)
     if path.is_file():
-        return VideoFileSource(path, camera, settings, on_state, tap)
+        return VideoFileSource(path, camera, settings, on_state, *taps)
     raise StreamOpenError(f"{path}: no such file or folder")

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -26,8 +26,8 @@ from companion.errors import (
 from companion.redaction import redacted
 from companion.sources.base import (
     GREY_RANGE_ADVICE,
+    FrameSource,
     PacketTap,
-    ReportingSource,
     SourceCounters,
     SourceSettings,
     StateCallback,
@@ -84,9 +84,9 @@ class VideoDecoder:
     """
 
     def __init__(
-        self, source: _Input, read_timeout_s: float | None, tap: PacketTap | None = None
+        self, source: _Input, read_timeout_s: float | None, taps: Sequence[PacketTap] = ()
     ) -> None:
-        self._tap = tap
+        self._taps = taps
         timeout = None if read_timeout_s is None else (_OPEN_TIMEOUT_S, read_timeout_s)
         form, options = source.format, source.options
         if source.datagrams is not None:
@@ -113,7 +113,7 @@ class VideoDecoder:
         context.thread_count = 1
         if read_timeout_s is not None:
             context.flags |= _LOW_DELAY
-        if tap is not None:
+        for tap in taps:
             tap.begin(self.stream)
 
     def pictures(self) -> Iterator[tuple[av.VideoFrame | None, int]]:
@@ -128,8 +128,8 @@ class VideoDecoder:
                 pictures = []
                 if self._damage is not None:
                     self._damage.add_undecodable(arrival_ns)
-            if self._tap is not None and packet.size:
-                self._tap.packet(packet)
+            for tap in self._taps if packet.size else ():
+                tap.packet(packet)
             late = self._is_predicted_from_lost(packet, arrival_ns)  # each packet: it counts them
             whole = [p for p in pictures if not self._is_damaged(p, arrival_ns) and not late]
             self.late += max(0, len(whole) - (1 if packet.size else 0))
@@ -153,7 +153,7 @@ class VideoDecoder:
         self._container.close()
 
 
-class VideoFileSource(ReportingSource):
+class VideoFileSource(FrameSource):
     """Every frame of a video file. Exposure time: start of `frames` plus time since the first
     frame.
     """
@@ -164,22 +164,16 @@ class VideoFileSource(ReportingSource):
         camera: Camera,
         settings: SourceSettings | None = None,
         on_state: StateCallback | None = None,
-        tap: PacketTap | None = None,
+        *taps: PacketTap,
     ) -> None:
         if not path.is_file():
             raise StreamOpenError(f"{path}: no such video file")
         super().__init__(camera, settings, on_state)
         self._path = path
-        self._tap = tap
+        self._taps = taps
         self._closed = threading.Event()
-        self._counters = SourceCounters()
         self._rgb = _ToRgb(self._settings.grey_range)
         self._rate_hz: float | None = None  # of a file without times
-
-    @property
-    def counters(self) -> SourceCounters:
-        """Counters so far; `dropped` stays 0."""
-        return self._counters
 
     def frames(self) -> Iterator[Frame]:
         """Every frame, with `realtime` at the times recorded. `StreamOpenError` for no video,
@@ -187,7 +181,7 @@ class VideoFileSource(ReportingSource):
         that do not fit.
         """
         try:
-            decoder = VideoDecoder(_Input(str(self._path), {}), None, self._tap)
+            decoder = VideoDecoder(_Input(str(self._path), {}), None, self._taps)
         except av.error.FFmpegError as error:
             raise StreamOpenError(
                 f"{self._path}: not a video, or damaged from the start: {error}"
@@ -219,16 +213,16 @@ class VideoFileSource(ReportingSource):
                 self._closed.wait((start + offset - time.monotonic_ns()) / 1e9)
             if self._closed.is_set():
                 return
-            n = self._counters.delivered
-            frame = Frame(self._rgb(picture, str(self._path)), start + offset, camera, n)
-            self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
-            _pass_exposure_time(self._tap, picture, frame.exposure_time_ns)
+            image, n = self._rgb(picture, str(self._path)), self._counters.delivered
+            frame = Frame(image, start + offset, camera, n)
+            self._count(received=1, delivered=1)
+            _pass_exposure_time(self._taps, picture, frame.exposure_time_ns)
             yield frame
         if not self._counters.delivered:
             raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
-        lost = max(0, self._counters.undecodable - decoder.late)
-        self._counters = replace(self._counters, undecodable=lost)
-        text = f"{self._path}: end of file, {self._delivered} pictures"
+        self._count(undecodable=-min(decoder.late, self._counters.undecodable))
+        lost = self._counters.undecodable
+        text = f"{self._path}: end of file, {self._counters.delivered} pictures"
         self._report(StreamState.ENDED, text + (f", {lost} undecodable" if lost else ""))
 
     def _settle_rate(self, decoder: VideoDecoder) -> str:
@@ -247,31 +241,24 @@ class VideoFileSource(ReportingSource):
         try:
             for picture, _ in decoder.pictures():
                 if picture is None:
-                    self._count_undecodable()
+                    self._count(undecodable=1)
                 else:
                     yield picture
         except av.error.FFmpegError as error:
             # A damaged rest ends the file as its end would: what was before it is still good.
-            self._count_undecodable()
-            _log.warning("%s: damaged after %d pictures: %s", self._path, self._delivered, error)
-
-    @property
-    def _delivered(self) -> int:
-        return self._counters.delivered
-
-    def _count_undecodable(self) -> None:
-        n = self._counters.undecodable + 1
-        self._counters = replace(self._counters, undecodable=n)
+            self._count(undecodable=1)
+            n = self._counters.delivered
+            _log.warning("%s: damaged after %d pictures: %s", self._path, n, error)
 
     def _pts_ns(self, picture: av.VideoFrame, decoder: VideoDecoder) -> int:
         stamp = _pts_ns(picture)
         if stamp is not None and self._rate_hz is None:
             return stamp
         rate = self._rate_hz or float(decoder.stream.average_rate or self._settings.rate_hz)
-        return round(self._delivered * 1e9 / rate)
+        return round(self._counters.delivered * 1e9 / rate)
 
 
-class LiveVideoSource(ReportingSource):
+class LiveVideoSource(FrameSource):
     """Decodes a live stream in a reader thread, which keeps only the newest frame. If the stream
     stops, the state becomes STALLED and the reader connects again, with longer waits after
     failures.
@@ -286,17 +273,15 @@ class LiveVideoSource(ReportingSource):
         settings: SourceSettings | None = None,
         on_state: StateCallback | None = None,
         on_stranger: Callable[[str], None] | None = None,
-        tap: PacketTap | None = None,
+        *taps: PacketTap,
     ) -> None:
         super().__init__(camera, settings, on_state)
-        self._tap, self._on_stranger = tap, on_stranger
+        self._taps, self._on_stranger = taps, on_stranger
         self._location = redacted(location)
         self._input = live_input(location, camera, self._settings, self._stranger)
         self._newest: Mailbox[tuple[av.VideoFrame, Camera, int, int]] = Mailbox()
         self._closing = threading.Event()
         self._reader: threading.Thread | None = None
-        self._lock = threading.Lock()
-        self._counters = SourceCounters()
         self._last_picture_ns = 0
         self._rgb = _ToRgb(self._settings.grey_range)
 
@@ -396,7 +381,7 @@ class LiveVideoSource(ReportingSource):
 
     def _receive_once(self, *, reconnect: bool) -> str:
         """Receive until the connection ends; returns the reason for the operator."""
-        decoder = VideoDecoder(self._input, self._settings.stall_timeout_s, self._tap)
+        decoder = VideoDecoder(self._input, self._settings.stall_timeout_s, self._taps)
         if reconnect:
             self._count(reconnects=1)
         clock = ExposureClock(
@@ -439,7 +424,7 @@ class LiveVideoSource(ReportingSource):
             return
         stamps = FrameTimestamps(_pts_ns(picture), misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns) - self._settings.late_ns
-        _pass_exposure_time(self._tap, picture, exposure_ns)
+        _pass_exposure_time(self._taps, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile
         self._count(received=1)
@@ -460,11 +445,6 @@ class LiveVideoSource(ReportingSource):
             self._count(misfits=1)
             self._report_change(StreamState.MISFIT, str(error))
             return None
-
-    def _count(self, **more: int) -> None:
-        with self._lock:
-            c = self._counters
-            self._counters = replace(c, **{k: getattr(c, k) + n for k, n in more.items()})
 
     def _stranger(self, host: str) -> None:
         _log.warning("%s: video of another sender ignored: %s", self._location, host)
@@ -570,6 +550,9 @@ def _pts_ns(picture: av.VideoFrame) -> int | None:
     return time_ns
 
 
-def _pass_exposure_time(tap: PacketTap | None, picture: av.VideoFrame, exposure_ns: int) -> None:
-    if tap is not None and picture.pts is not None and picture.time_base is not None:
-        tap.frame_exposed(Fraction(picture.pts * picture.time_base), exposure_ns)
+def _pass_exposure_time(
+    taps: Sequence[PacketTap], picture: av.VideoFrame, exposure_ns: int
+) -> None:
+    for tap in taps:
+        if picture.pts is not None and picture.time_base is not None:
+            tap.frame_exposed(Fraction(picture.pts * picture.time_base), exposure_ns)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from enum import Enum
 from fractions import Fraction
 from typing import Annotated, Protocol
@@ -12,7 +13,7 @@ from typing import Annotated, Protocol
 import av
 from av.format import Flags
 from av.stream import Disposition
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from companion.errors import StreamOpenError, StreamSizeError
 from companion.sources.datagrams import parse_sender
@@ -21,6 +22,7 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange
 from localizer.types import Frame
+from mavlink_bridge.config import StrictModel
 
 _log = logging.getLogger(__name__)
 _LEAST_SHARE = 10  # a film has at least a tenth of the pictures of the longest: thumbnails have few
@@ -79,10 +81,8 @@ class SourceCounters:
 Count = Annotated[int, Field(ge=0, le=65535)]  # of a 16-bit sensor
 
 
-class SourceSettings(BaseModel):
+class SourceSettings(StrictModel):
     """Settings of a camera feed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     latency_ms: float = Field(
         default=0.0,
@@ -161,28 +161,6 @@ class PacketTap(Protocol):
         ...
 
 
-class PacketTaps:
-    """Combines several taps."""
-
-    def __init__(self, taps: Sequence[PacketTap]) -> None:
-        self._taps = tuple(taps)
-
-    def begin(self, stream: av.VideoStream) -> None:
-        """As of `PacketTap`."""
-        for tap in self._taps:
-            tap.begin(stream)
-
-    def packet(self, packet: av.Packet) -> None:
-        """As of `PacketTap`."""
-        for tap in self._taps:
-            tap.packet(packet)
-
-    def frame_exposed(self, pts: Fraction, exposure_time_ns: int) -> None:
-        """As of `PacketTap`."""
-        for tap in self._taps:
-            tap.frame_exposed(pts, exposure_time_ns)
-
-
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
     """The container's video stream, not a cover image or thumbnails. If there are several, FFmpeg's
     choice, which is logged. where: location for the error text. `StreamOpenError` without one.
@@ -210,34 +188,10 @@ def has_times(container: av.container.InputContainer) -> bool:
     return not container.format.flags & Flags.no_timestamps.value
 
 
-class FrameSource(Protocol):
-    """A camera feed. One consumer iterates `frames`; `close` may be called from any thread."""
-
-    def frames(self) -> Iterator[Frame]:
-        """Yield frames in order of exposure, until a file ends or the source is closed.
-
-        If a live stream stops, the iteration waits: the source reports its state and connects
-        again.
-        """
-        ...
-
-    def close(self) -> None:
-        """End `frames` and free device or socket; harmless when called again."""
-        ...
-
-    @property
-    def counters(self) -> SourceCounters:
-        """Counters so far."""
-        ...
-
-    @property
-    def state(self) -> StreamState:
-        """State of the feed."""
-        ...
-
-
-class ReportingSource:
-    """What every `FrameSource` has: camera model, settings, and a state that it reports."""
+class FrameSource:
+    """A camera feed, with its camera model, settings, counters and a state that it reports. One
+    consumer iterates `frames`; `close` may be called from any thread.
+    """
 
     def __init__(
         self, camera: Camera, settings: SourceSettings | None, on_state: StateCallback | None
@@ -245,11 +199,35 @@ class ReportingSource:
         self._camera, self._settings = camera, settings or SourceSettings()
         self._on_state = on_state
         self._state = StreamState.IDLE
+        self._lock = threading.Lock()
+        self._counters = SourceCounters()
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield frames in order of exposure, until a file ends or the source is closed.
+
+        If a live stream stops, the iteration waits: the source reports its state and connects
+        again.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """End `frames` and free device or socket; harmless when called again."""
+        raise NotImplementedError
+
+    @property
+    def counters(self) -> SourceCounters:
+        """Counters so far."""
+        return self._counters
 
     @property
     def state(self) -> StreamState:
         """State of the feed."""
         return self._state
+
+    def _count(self, **more: int) -> None:
+        with self._lock:
+            c = self._counters
+            self._counters = replace(c, **{k: getattr(c, k) + n for k, n in more.items()})
 
     def _report(self, state: StreamState, text: str) -> None:
         self._state = state
@@ -263,8 +241,12 @@ class ReportingSource:
     def _report_scaling(self, camera: Camera, where: str) -> None:
         """Report if `camera`, the model of a frame, is the calibrated one scaled."""
         if camera is not self._camera:
-            text = scaling_text(camera.width, camera.height, self._camera, where)
-            self._report_change(StreamState.SCALED, text)
+            self._report_change(
+                StreamState.SCALED,
+                f"{where}: delivers {camera.width}x{camera.height}, taken as the calibrated "
+                f"{self._camera.width}x{self._camera.height} scaled down or up (wrong if the "
+                "camera crops or zooms)",
+            )
 
 
 def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
@@ -285,11 +267,3 @@ def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera
     except CameraError as error:
         text = f"{where} delivers {width}x{height}: {error}"
         raise StreamSizeError(text, (width, height)) from error
-
-
-def scaling_text(width: int, height: int, camera: Camera, where: str) -> str:
-    """Warning for the operator: frames have another size (width x height) than `camera`."""
-    return (
-        f"{where}: delivers {width}x{height}, taken as the calibrated "
-        f"{camera.width}x{camera.height} scaled down or up (wrong if the camera crops or zooms)"
-    )

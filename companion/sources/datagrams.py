@@ -120,11 +120,6 @@ class SenderLock:
         self._since_ns = self._heard_ns = 0
 
     @property
-    def sender(self) -> Address | None:
-        """The accepted sender; None before the first."""
-        return self._sender
-
-    @property
     def has_chosen(self) -> bool:
         """Whether a sender is accepted or configured: datagrams of others count as foreign."""
         return self._sender is not None or self._only is not None

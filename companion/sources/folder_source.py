@@ -13,8 +13,7 @@ import cv2
 from companion.errors import StreamDecodeError, StreamOpenError
 from companion.sources.base import (
     GREY_RANGE_ADVICE,
-    ReportingSource,
-    SourceCounters,
+    FrameSource,
     SourceSettings,
     StateCallback,
     StreamState,
@@ -102,7 +101,7 @@ def exposure_times_of(folder: Path, images: Sequence[Path]) -> tuple[int, ...] |
     return tuple(by_name[path.name] for path in images)
 
 
-class FolderSource(ReportingSource):
+class FolderSource(FrameSource):
     """Frames from the images of a folder (`StreamOpenError` without any). Exposure times (ns) are
     those of ``timestamps.txt``; without that file, they begin when `frames` does and follow at
     `rate_hz`. With `realtime`, recorded times are shifted to begin then.
@@ -120,12 +119,6 @@ class FolderSource(ReportingSource):
         self._images = list_images(folder)
         self._times = exposure_times_of(folder, self._images)
         self._closed = threading.Event()
-        self._delivered = 0
-
-    @property
-    def counters(self) -> SourceCounters:
-        """Counters so far; `dropped` stays 0."""
-        return SourceCounters(received=self._delivered, delivered=self._delivered)
 
     def frames(self) -> Iterator[Frame]:
         """Every image; raises `StreamDecodeError` or `StreamSizeError`, which name the file."""
@@ -140,7 +133,7 @@ class FolderSource(ReportingSource):
             if self._closed.is_set():
                 return
             frame = self._load(path, (first if recorded else start) + offset, sequence)
-            self._delivered += 1
+            self._count(received=1, delivered=1)
             yield frame
         self._report(StreamState.ENDED, f"{self._folder}: all {len(self._images)} images delivered")
 

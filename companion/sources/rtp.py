@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Literal
-
-from companion.sources.transport import TransportStream
 
 Kind = Literal["mpegts", "rtp h264", "rtp hevc", "rtp mpegts", "h264", "hevc"]
 FORMATS: dict[Kind, str] = {
@@ -28,6 +27,10 @@ _HEVC_TYPES, _HEVC_MANY, _HEVC_PART = {0, 1, 2, *range(4, 10), *range(16, 22), *
                                        48, 49}, 48, 49  # fmt: skip
 _RATE_HZ = 90_000  # of RTP's video times
 _WRAP = 1 << 32
+_BODY = 184  # bytes of a packet after its header
+_PMT, _VIDEO, _HEVC = 0x1000, 0x0100, 0x24  # PIDs; H.265's stream type
+_FIRST = 90_000  # the first picture's time: earlier ones may follow
+_PES = b"\x00\x00\x01\xe0"
 
 
 def video_format(data: bytes) -> Kind | None:
@@ -88,6 +91,69 @@ def _codec(unit: bytes) -> Literal["h264", "hevc"] | None:
     return "h264" if unit[0] & 0x1F in _H264_TYPES else None
 
 
+class TransportStream:
+    """Encodes frames of one H.265 stream as MPEG-TS (ISO/IEC 13818-1), with the tables before each,
+    because FFmpeg's IVF has no H.265. An empty PES packet follows each frame: FFmpeg outputs a
+    frame when the next packet begins.
+    """
+
+    def __init__(self) -> None:
+        self._counts = {0: 0, _PMT: 0, _VIDEO: 0}
+
+    def encode_frame(self, data: bytes, time: int) -> bytes:
+        """The next frame as MPEG-TS packets. data: its H.265, Annex B; time: its presentation time,
+        in 1/90000 s since the first frame.
+        """
+        video = 0xE000 | _VIDEO
+        pat = struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 1, 0xE000 | _PMT)
+        pmt = struct.pack(">HBBBHHBHH", 1, 0xC1, 0, 0, video, 0xF000, _HEVC, video, 0xF000)
+        stamp = _stamp(time + _FIRST)
+        return b"".join((
+            self._packets(0, _section(0, pat)),
+            self._packets(_PMT, _section(2, pmt)),
+            self._packets(_VIDEO, _PES + b"\0\0" + stamp + data),
+            self._packets(_VIDEO, _PES + struct.pack(">H", len(stamp)) + stamp),
+        ))  # fmt: skip
+
+    def _packets(self, pid: int, payload: bytes) -> bytes:
+        made = []
+        for at in range(0, len(payload), _BODY):
+            part, count = payload[at : at + _BODY], self._counts[pid]
+            self._counts[pid] = (count + 1) & 0x0F
+            head = pid | (0x4000 if at == 0 else 0)
+            stuffing = b""
+            if len(part) < _BODY:  # an adaptation field: its length, its flags, filling
+                left = _BODY - 1 - len(part)
+                stuffing = bytes([left]) + (b"\0" + b"\xff" * (left - 1) if left else b"")
+            control = (0x30 if stuffing else 0x10) | count
+            made.append(struct.pack(">BHB", 0x47, head, control) + stuffing + part)
+        return b"".join(made)
+
+
+def _stamp(time: int) -> bytes:
+    """Flags and presentation time (33 bits) of a PES packet; time in 1/90000 s."""
+    t = time & 0x1_FFFF_FFFF
+    high, middle, low = t >> 30, t >> 15 & 0x7FFF, t & 0x7FFF
+    return b"\x80\x80\x05" + struct.pack(">BHH", 0x21 | high << 1, middle << 1 | 1, low << 1 | 1)
+
+
+def _section(table: int, body: bytes) -> bytes:
+    """A table's section with its checksum, after the pointer to it."""
+    data = struct.pack(">BH", table, 0xB000 | len(body) + 4) + body
+    crc = 0xFFFF_FFFF
+    for byte in data:
+        crc = (crc << 8 & 0xFFFF_FFFF) ^ _crc_of((crc >> 24) ^ byte)
+    return b"\0" + data + struct.pack(">I", crc)
+
+
+@cache
+def _crc_of(byte: int) -> int:
+    crc = byte << 24
+    for _ in range(8):
+        crc = (crc << 1 & 0xFFFF_FFFF) ^ (0x04C1_1DB7 if crc & 0x8000_0000 else 0)
+    return crc
+
+
 @dataclass
 class RtpDepacketizer:
     """Assembles RTP packets of H.264 or H.265 to IVF or MPEG-TS, each frame with its time.
@@ -98,8 +164,6 @@ class RtpDepacketizer:
 
     codec: Literal["h264", "hevc"]
     sets: bytes = b""
-    lost: int = 0
-    """Pictures that lacked a packet."""
     _begun: bool = False
     _units: list[bytes] = field(default_factory=list)
     _whole: bool = True
@@ -163,7 +227,6 @@ class RtpDepacketizer:
         units, whole, time = b"".join(self._units), self._whole, self._time
         self._units, self._whole, self._time = [], True, None
         if not units or not whole or time is None:
-            self.lost += bool(units)
             return b""
         if self._told is not None:
             step = (time - self._told) % _WRAP

@@ -16,13 +16,14 @@ from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.config import StrictModel
 
 Level = Annotated[float, Field(ge=0.0, le=100.0)]
 Factor = Annotated[float, Field(ge=0.2, le=50.0)]
@@ -33,10 +34,9 @@ _REMEMBERED = 32  # pictures under way
 _AGAIN_NS = 10_000_000_000  # the same trouble is reported so often
 
 
-class ZoomTable(BaseModel):
+class ZoomTable(StrictModel):
     """Table of the focal length by zoom level."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     points: tuple[tuple[Level, Factor], ...] = Field(
         min_length=2,
         description="CAMERA_SETTINGS level and focal length as a multiple of `model`'s",
@@ -104,8 +104,8 @@ class FocalCorrection:
 
 
 class ZoomedFrames:
-    """Sets the camera model of each frame by its zoom, on the feed's thread; `factor` and `learn`
-    may be called from any thread.
+    """Sets the camera model of each frame by its zoom, on the feed's thread; `learn` may be
+    called from any thread.
 
     level_at(time_ns, hold_s): the zoom level (0 to 100) that the camera reported within hold_s of
     that time, None if unknown. report: receives an alert when a problem begins, and every ten
@@ -125,7 +125,6 @@ class ZoomedFrames:
         self._by_table: float | None = None  # the newest picture's factor
         self._assigned: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
         self._reported_ns: int | None = None
-        self.unknown = 0  # frames
 
     def __call__(self, frame: Frame) -> Frame | None:
         """The frame with its camera model. If the focal length is unknown, an alert is reported and
@@ -148,16 +147,6 @@ class ZoomedFrames:
             self._assigned.append((frame.exposure_time_ns, by_table, factor))
         return replace(frame, camera=with_focal_factor(frame.camera, factor))
 
-    def zoom_filter(self, take: Callable[[Frame], object]) -> Callable[[Frame], None]:
-        """A receiver of frames that passes those with known zoom to `take`, with their camera."""
-
-        def hand_on(frame: Frame) -> None:
-            known = self(frame)
-            if known is not None:
-                take(known)
-
-        return hand_on
-
     def learn(self, estimate: PoseEstimate) -> None:
         """Correct the table by a registered frame's focal length; any thread, never blocks. Ignored
         if the table's `refine` is 0, or the zoom has changed since.
@@ -171,14 +160,7 @@ class ZoomedFrames:
                 if time_ns == estimate.exposure_time_ns and same:
                     self._correction.learn(math.log(fit.factor * factor / by_table), fit.sigma)
 
-    @property
-    def factor(self) -> float | None:
-        """Focal length of the newest frame with known zoom, times the model's; None without one."""
-        with self._lock:
-            return self._factor
-
     def _report_unknown(self, level: float | None, time_ns: int) -> None:
-        self.unknown += 1
         if self._reported_ns is not None and 0 <= time_ns - self._reported_ns < _AGAIN_NS:
             return
         self._reported_ns = time_ns

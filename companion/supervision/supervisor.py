@@ -16,16 +16,18 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from companion.supervision.processes import ENDING, Beat
+from companion.supervision.processes import ENDING, Beat, FlightProcess
+from companion.supervision.service_manager import ServiceManager
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Name, ProcessFault
+from mavlink_bridge.atomic_file import replace_file
 
 _log = logging.getLogger(__name__)
 _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
@@ -35,35 +37,6 @@ _MOST_DEATHS = 64  # that are remembered: more within the window wait no longer
 _WORDS_S = 3.0  # for a death to be reported, or marked
 _PART = 10  # characters of a part's name, so that the line is one STATUSTEXT
 _USAGE = 2  # exit code of a named error
-
-
-class Process(Protocol):
-    """A flight process, as `FlightProcess`."""
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-
-    def release(self) -> None:
-        """Let a standby fly."""
-
-    def wait(self, timeout_s: float) -> int | None:
-        """Wait up to timeout_s; exit code, negative for a signal, or None while it runs."""
-
-    def beats(self) -> Sequence[Beat]:
-        """Signs of life since the last call."""
-
-    def kill(self) -> None:
-        """Kill a process that hangs."""
-
-    def close(self) -> None:
-        """Close the pipes."""
-
-    def send_signal(self, number: int) -> None:
-        """Send the signal `number`; harmless if the process has ended."""
-
-    def dismiss(self) -> None:
-        """End a standby that is not needed, and reap it."""
 
 
 @dataclass(frozen=True)
@@ -93,19 +66,6 @@ class RestartPolicy:
     ending_s: float = 60.0
 
 
-class Manager(Protocol):
-    """The service manager, which restarts the supervisor if it is silent for long."""
-
-    def ready(self) -> None:
-        """Report that a flight process works: each component has completed a cycle."""
-
-    def alive(self) -> None:
-        """Report that the flight process is supervised and does not hang."""
-
-    def status(self, text: str) -> None:
-        """Report the status as text."""
-
-
 class Supervisor:
     """Starts, watches and restarts flight processes; `run` until the flight is over.
 
@@ -116,20 +76,20 @@ class Supervisor:
 
     def __init__(
         self,
-        spawn: Callable[[bool], Process],
+        spawn: Callable[[bool], FlightProcess],
         tell: Callable[[Alert], None],
         mark: Callable[[int, str], None],
         policy: RestartPolicy | None = None,
-        manager: Manager | None = None,
+        manager: ServiceManager | None = None,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self._spawn, self._tell, self._mark = spawn, tell, mark
         self._policy = policy or RestartPolicy()
-        self._manager = manager
+        self._manager = manager or ServiceManager("")
         self._clock, self._pause = clock, pause
-        self._flying: Process | None = None
-        self._standby: Process | None = None
+        self._flying: FlightProcess | None = None
+        self._standby: FlightProcess | None = None
         self._deaths: deque[float] = deque(maxlen=_MOST_DEATHS)
         self._since_s = self._no_standby_until_s = 0.0
         self._heard_s = self._looked_s = self._patience_s = 0.0
@@ -147,15 +107,14 @@ class Supervisor:
         try:
             while True:
                 code = self._watch()
-                hangs = self._hanging() if code is None and not self._stopping else ""
-                if hangs:
-                    code = self._end_what_hangs()
                 if code is None:
-                    continue
-                if not hangs and (self._stopping or code == 0 or self._is_hopeless(code)):
-                    return code
-                if hangs:
+                    hangs = "" if self._stopping else self._hanging()
+                    if not hangs:
+                        continue
+                    code = self._kill()
                     self._recover(ProcessFault.HANGS, Name(hangs))
+                elif self._stopping or code == 0 or self._is_hopeless(code):
+                    return code
                 else:
                     self._recover(ProcessFault.DIED, Name(exit_code_text(code)))
                 if self._flying is None:  # an order to end came while it waited
@@ -172,7 +131,7 @@ class Supervisor:
         if self._flying is not None:
             self._flying.send_signal(number)
 
-    def _fly(self, process: Process, patience_s: float) -> None:
+    def _fly(self, process: FlightProcess, patience_s: float) -> None:
         if self._flying is not None:
             self._flying.close()
         self._flying, self._since_s = process, self._clock()
@@ -212,7 +171,7 @@ class Supervisor:
             self._heard_s = now_s
         elif now_s - self._heard_s > self._patience_s:
             hangs = "process"
-        if self._manager is not None and not hangs:
+        if not hangs:
             self._manager.alive()  # a start, too, which may compile: it has its patience here
         return hangs
 
@@ -220,13 +179,12 @@ class Supervisor:
         """Report once all components had a cycle since the first sign of life."""
         if self._shown_s is None:
             self._shown_s = now_s
-        if self._manager is None or last.age_s >= now_s - self._shown_s or not self._is_new:
-            return
-        self._is_new = False
-        self._manager.ready()
-        self._manager.status("flying")
+        if self._is_new and last.age_s < now_s - self._shown_s:
+            self._is_new = False
+            self._manager.ready()
+            self._manager.status("flying")
 
-    def _end_what_hangs(self) -> int:
+    def _kill(self) -> int:
         assert self._flying is not None
         self._flying.kill()
         return -signal.SIGKILL
@@ -260,8 +218,7 @@ class Supervisor:
             self._fly(process, self._policy.released_s)
         _do_in_time("tell", lambda: self._tell(news))
         _do_in_time("mark", lambda: self._mark(dead, body(news)))
-        if self._manager is not None:
-            self._manager.status(body(news))
+        self._manager.status(body(news))
         if process is None:
             self._cold_start(wait_s)
 
@@ -296,8 +253,7 @@ class Supervisor:
             if self._stopping:
                 return
             self._pause(_PAUSE_S)
-            if self._manager is not None:
-                self._manager.alive()
+            self._manager.alive()
 
 
 def _do_in_time(name: str, do: Callable[[], None]) -> None:
@@ -336,7 +292,8 @@ def mark_dead(folder: Path, pid: int, text: str) -> None:
     for path in folder.parent.glob(f"{glob.escape(folder.name)}*/health.json"):
         report = _report(path)
         if report.get("pid") == pid:
-            _mark(path, report, text)
+            report.update(level="failed", text=text, time_ns=time.monotonic_ns())
+            replace_file(path, json.dumps(report, indent=1), path.stat().st_mode & 0o777)
 
 
 def _report(path: Path) -> dict[str, Any]:
@@ -344,10 +301,3 @@ def _report(path: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError):
         return {}
-
-
-def _mark(path: Path, report: dict[str, Any], text: str) -> None:
-    temporary = path.with_suffix(".dead")
-    report.update(level="failed", text=text, time_ns=time.monotonic_ns())
-    temporary.write_text(json.dumps(report, indent=1), encoding="utf-8")
-    temporary.replace(path)

@@ -65,12 +65,20 @@ def show_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[No
         with console.status(escape(what)):
             yield
         return
-    work = _Work(console, what, every_s)
-    work.wait(_SILENT_S)
+    begun_s, over = time.monotonic(), threading.Event()
+
+    def tell() -> None:
+        wait_s = _SILENT_S
+        while not over.wait(wait_s):
+            line = f"{time.monotonic() - begun_s:4.0f} s {what}"
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
+            wait_s = every_s
+
+    threading.Thread(target=tell, name="progress", daemon=True).start()
     try:
         yield
     finally:
-        work.end()
+        over.set()
 
 
 def tally(show: Callable[..., None], total: int | None = None) -> Callable[..., None]:
@@ -109,34 +117,3 @@ class _Lines:
         self._printed_s = time.monotonic() - self._begun_s
         line = f"{self._printed_s:4.0f} s {self._what}: {text}"
         self._console.print(line, highlight=False, soft_wrap=True, markup=False)
-
-
-class _Work:
-    """Log lines of work that cannot be counted."""
-
-    def __init__(self, console: Console, what: str, every_s: float) -> None:
-        self._console, self._what, self._every_s = console, what, every_s
-        self._begun_s = time.monotonic()
-        self._lock = threading.Lock()
-        self._timer: threading.Timer | None = None
-        self._over = False
-
-    def wait(self, seconds: float) -> None:
-        """Write a line in `seconds`, unless the work ends before."""
-        with self._lock:
-            if not self._over:
-                self._timer = threading.Timer(seconds, self._tell)
-                self._timer.daemon = True
-                self._timer.start()
-
-    def end(self) -> None:
-        """Write no more lines."""
-        with self._lock:
-            self._over = True
-            if self._timer is not None:
-                self._timer.cancel()
-
-    def _tell(self) -> None:
-        line = f"{time.monotonic() - self._begun_s:4.0f} s {self._what}"
-        self._console.print(line, highlight=False, soft_wrap=True, markup=False)
-        self.wait(self._every_s)

@@ -31,11 +31,17 @@ def _write(tmp_path: Path, data: object) -> Path:
 def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
     targets = {"detector": {"model": "cars.onnx"}}
     given = {"record": {"folder": "out"}, "state_dir": "state", "targets": targets}
-    config = load_config(_write(tmp_path, MINIMAL | given))
+    camera = CAMERA | {"source": "film.mp4"}
+    signed = {"signing": {"key_file": "fc.key"}, "tlog": "fc.tlog"}
+    config = load_config(_write(tmp_path, MINIMAL | given | {"camera": camera, "bridge": signed}))
     assert config.map == tmp_path / "cache"
     assert config.record.folder == tmp_path / "out"
     assert config.state_folder == tmp_path / "state"
     assert config.targets.detector.model == tmp_path / "cars.onnx"
+    assert config.camera.source == str(tmp_path / "film.mp4")
+    assert config.bridge.tlog == tmp_path / "fc.tlog"
+    assert config.bridge.signing.key_file == tmp_path / "fc.key"
+    assert config.bridge.signing.state_file == tmp_path / "state" / "fc.key.fc.seen"
     assert config.camera.model.camera().fx == 550
 
 
@@ -111,17 +117,19 @@ def test_files_that_are_no_mapping(tmp_path, text):
         load_config(_write(tmp_path, text))
 
 
-def test_a_file_without_end_is_not_read_to_its_end():
-    with pytest.raises(ConfigError, match="cannot be read: is not a plain file"):
-        load_config(Path("/dev/zero"))
-
-
-def test_a_log_given_by_mistake_is_not_read_to_its_end(tmp_path):
-    path = tmp_path / "flight.log"
-    with path.open("wb") as file:
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("none.yaml", "No such file"),
+        ("/dev/zero", "is not a plain file"),  # it has no end
+        ("flight.log", "is larger than 1 MiB"),  # given by mistake
+    ],
+)
+def test_what_is_no_settings_file_is_not_read_to_its_end(tmp_path, name, why):
+    with (tmp_path / "flight.log").open("wb") as file:
         file.truncate(1 << 40)  # sparse
-    with pytest.raises(ConfigError, match="cannot be read: is larger than 1 MiB"):
-        load_config(path)
+    with pytest.raises(ConfigError, match=f"cannot be read: {why}"):
+        load_config(tmp_path / name)
 
 
 def test_merged_mappings_that_multiply_are_refused(tmp_path):
@@ -147,11 +155,6 @@ def test_the_mode_off_needs_no_quotes(tmp_path):
     assert load_config(_write(tmp_path, text)).bridge.mode == "off"
     with pytest.raises(ConfigError, match=r"bridge\.mode: "):
         load_config(_write(tmp_path, text.replace("off", "on")))
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_config(tmp_path / "none.yaml")
 
 
 DEPLOYMENT = Path(__file__).parents[2] / "configs" / "deployment.yaml"

@@ -188,7 +188,7 @@ def test_a_feed_never_tells_its_password(caplog: pytest.LogCaptureFixture) -> No
     url = "rtsp://admin:s3cret@127.0.0.1:9/none"
     source = open_source(url, Camera.from_fov(320, 240, 70.0), SourceSettings(), on_state)
     assert list(source.frames()) == []
-    assert any("***@127.0.0.1" in text for text in told)
+    assert any("***@127.0.0.1:9/none: cannot connect" in text for text in told)
     assert "s3cret" not in "".join(told) + caplog.text
 
 
@@ -208,7 +208,7 @@ def test_what_a_flight_writes_is_not_for_everybody(tmp_path, monkeypatch):
         def run(self) -> None:
             (tmp_path / "record" / "events.csv").write_text("x")
 
-    monkeypatch.setattr("companion.flight.standby.Companion", Flying)
+    monkeypatch.setattr("companion.flight.app.Companion", Flying)
     monkeypatch.setattr("signal.signal", lambda *_: None)
     deployment = Path(__file__).parents[2] / "configs" / "deployment.yaml"
     result = CliRunner().invoke(app, ["run", str(deployment)])

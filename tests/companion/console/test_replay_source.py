@@ -1,12 +1,9 @@
 """A record in the page: rows at their times, and the time bar."""
 
 import asyncio
-import csv
 import json
 import struct
 
-import cv2
-import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -19,33 +16,15 @@ from companion.offline.record import read_record
 from companion.reporting.pictures import map_pictures
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import TlogRecorder
-from tests.companion.console.record_of import write_rows
+from tests.companion.console.record_of import write_record, write_rows
 
-MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
 S = 1_000_000_000
+TIMES = {"tracks_s": 11, "event_s": 15, "picture_s": 14}
 
 
 @pytest.fixture
 def source(tmp_path):
-    (tmp_path / "snapshots").mkdir()
-    states = ["tracking"] * 11 + ["lost"] * 10
-    write_rows(
-        tmp_path / "estimates.csv", ESTIMATE_COLUMNS,
-        [
-            {"exposure_time_ns": (10 + i) * S, "qx": 1.0, "state": s, "status": "OK",
-             "latitude_deg": 47 + i * 1e-5, "accepted": int(s == "tracking")}
-            for i, s in enumerate(states)
-        ],
-    )  # fmt: skip
-    target = {"exposure_time_ns": 12 * S, "target_id": "car"}
-    write_rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
-    event = {"time_ns": 15 * S, "level": "warning", "text": "GNSS lost"}
-    write_rows(tmp_path / "events.csv", EVENT_COLUMNS, [event])
-    image = np.full((48, 64, 3), 90, np.uint8)
-    cv2.imwrite(str(tmp_path / "snapshots" / f"{14 * S}.jpg"), image)
-    manifest = {"monotonic_ns": 10 * S, "utc_ns": 1000 * S, "config": {"camera": {"model": MODEL}}}
-    (tmp_path / "record.json").write_text(json.dumps(manifest))
-    return ReplaySource(read_record(tmp_path))
+    return ReplaySource(read_record(write_record(tmp_path / "flight", **TIMES)))
 
 
 def _at(source, share):
@@ -55,15 +34,15 @@ def _at(source, share):
 
 def test_the_time_bar_leads_to_what_was_known_then(source):
     state = _at(source, 0.1)
-    assert state["estimate"]["latitude_deg"] == pytest.approx(47 + 2e-5)
+    assert (state["estimate"]["time_ns"], state["estimate"]["latitude_deg"]) == (12 * S, 47.0)
     assert [t["name"] for t in state["targets"]] == ["car"]
     assert (state["health"]["level"], state["events"], source.newest.frame) == ("ok", [], None)
     assert state["utc_ns"] == 1002 * S
     state = _at(source, 0.75)
     assert (state["estimate"]["state"], state["health"]["level"]) == ("lost", "failed")
-    assert [e["text"] for e in state["events"]] == ["GNSS lost"]
+    assert [e["text"] for e in state["events"]] == ["PiLoT: localization lost 9 s"]
     assert state["targets"] == []  # seen 13 s ago
-    assert source.newest.frame.head["image"] == [64, 48]
+    assert source.newest.frame.head["image"] == [480, 360]
 
 
 def test_figures_of_the_head_are_those_of_that_moment(source):
@@ -84,27 +63,20 @@ def test_a_kept_picture_is_no_live_one_and_says_where_its_targets_were(source):
     assert (head["exposure_ns"], head["exposure_utc_ms"]) == (14 * S, None)
 
 
-def test_with_the_map_the_picture_has_its_edges_and_the_autopilot_its_track(
-    source, small_assets, tmp_path
-):
-    """The camera stands 60 m above the map's origin and looks down."""
-    manifest = json.loads((tmp_path / "record.json").read_text())
-    manifest["config"]["bridge"] = {"tlog": str(tmp_path / "flight.tlog")}
-    (tmp_path / "record.json").write_text(json.dumps(manifest))
-    with (tmp_path / "estimates.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    cache = TileCache.open(small_assets.map_cache)
-    up = float(cache.index.box_min[0, 2]) + 60.0
-    write_rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [r | {"up_m": up} for r in rows])
-    at, codec = cache.frame.origin, mavlink.MAVLink(None, 1, 1)
+def test_with_the_map_the_picture_has_its_edges_and_the_autopilot_its_track(small_assets, tmp_path):
+    """The camera stands 80 m above the map's origin and looks down."""
+    tlog = tmp_path / "flight.tlog"
+    bridge = {"tlog": str(tlog)}
+    record = write_record(tmp_path / "flight", small_assets.map_cache, **TIMES, bridge=bridge)
+    at, codec = TileCache.open(small_assets.map_cache).frame.origin, mavlink.MAVLink(None, 1, 1)
     place = (round(at.latitude_deg * 1e7), round(at.longitude_deg * 1e7), 0)
-    log = TlogRecorder(tmp_path / "flight.tlog")
+    log = TlogRecorder(tlog)
     log.start()
     position = mavlink.MAVLink_global_position_int_message(1, *place, 0, 0, 0, 0, 0)
     log.write(position.pack(codec), 1004_000_000)
     log.close()
     with map_pictures(small_assets.map_cache) as pictures:
-        source = ReplaySource(read_record(tmp_path), pictures)
+        source = ReplaySource(read_record(record), pictures)
         state = _at(source, 0.25)
         assert state["vehicle"]["latitude_deg"] == pytest.approx(at.latitude_deg, abs=1e-6)
         message = page_message(source.newest.frame, True)

@@ -299,37 +299,28 @@ def test_every_answer_forbids_foreign_script_and_a_report_runs_on_its_own(site, 
         assert report.headers["content-security-policy"].startswith("sandbox allow-scripts;")
 
 
-def test_a_page_that_only_reads_can_do_nothing(site, deployment):
-    source = Still()
-    before = deployment.read_text()
-    with _client(site(source, control=False)) as client:
-        for path, body in (
-            ("/api/order", {"do": "hint", "latitude_deg": 1, "longitude_deg": 1, "radius_m": 9}),
-            ("/api/doctor", {}),
-            ("/api/deployment", {"text": before + "\n", "write": True}),
-        ):
-            assert client.post(path, json=body, headers=SAME).status_code == 409
-        shown = client.get("/api/deployment").json()
-        assert "secret" not in shown["text"]
-        assert not shown["editable"]
-    assert not source.orders
-    assert deployment.read_text() == before
-
-
-@pytest.mark.parametrize(("armed", "connected"), [(True, True), (False, False)])
-def test_while_armed_or_not_heard_only_targets_and_hints(site, deployment, armed, connected):
+@pytest.mark.parametrize(
+    ("control", "armed", "connected"),
+    [(False, False, True), (True, True, True), (True, False, False)],
+    ids=["only reads", "armed", "vehicle not heard"],
+)
+def test_a_page_does_no_more_than_it_may(site, deployment, control, armed, connected):
+    """One that only reads does nothing; in flight there are targets and hints."""
     source = Still(armed, connected)
     before = deployment.read_text()
-    with _client(site(source)) as client:
+    allowed = 200 if control else 409
+    with _client(site(source, control=control)) as client:
         for path, body in (
             ("/api/doctor", {}), ("/api/deployment", {"text": before + "\n", "write": True}),
         ):  # fmt: skip
             assert client.post(path, json=body, headers=SAME).status_code == 409
         for do in ("target", "hint"):
-            assert client.post("/api/order", json={"do": do}, headers=SAME).status_code == 200
+            assert client.post("/api/order", json={"do": do}, headers=SAME).status_code == allowed
         for wrong in ("arm", "", None, 5):
             assert client.post("/api/order", json={"do": wrong}, headers=SAME).status_code == 409
-    assert [o["do"] for o in source.orders] == ["target", "hint"]
+        shown = client.get("/api/deployment").json()
+        assert ("secret" in shown["text"], shown["editable"]) == (control, control)
+    assert [o["do"] for o in source.orders] == (["target", "hint"] if control else [])
     assert deployment.read_text() == before
 
 
@@ -371,8 +362,8 @@ def test_with_a_certificate_only_tls_is_spoken_and_only_with_the_token(deploymen
     command = [sys.executable, "-m", "companion", "console", str(deployment), "--lifeline"]
     trusted = ssl.create_default_context(cafile=certificate)
 
-    def ask(path, **headers):
-        line = http.client.HTTPSConnection(listen, context=trusted, timeout=30)
+    def ask(path, line=None, **headers):
+        line = line or http.client.HTTPSConnection(listen, context=trusted, timeout=30)
         line.request("GET", path, headers=headers)
         answer = line.getresponse()
         answer.read()
@@ -387,9 +378,8 @@ def test_with_a_certificate_only_tls_is_spoken_and_only_with_the_token(deploymen
             cookie = answer.headers["set-cookie"]
             assert (answer.status, "; Secure" in cookie) == (303, True)
             assert ask("/api/records", cookie=cookie.split(";")[0]).status == 200
-            plain = http.client.HTTPConnection(listen, timeout=10)
             with pytest.raises((http.client.HTTPException, OSError)):
-                _answer(plain)
+                ask("/", http.client.HTTPConnection(listen, timeout=10))
         finally:
             process.stdin.close()
             process.wait(20)
@@ -495,11 +485,6 @@ def _connected(*pieces):
 )  # fmt: skip
 def test_a_request_has_to_be_whole_in_time_and_an_answer_has_all_of_it(pieces, stays):
     assert _connected(*pieces) is stays
-
-
-def _answer(line):
-    line.request("GET", "/")
-    return line.getresponse()
 
 
 def test_settings_are_checked_before_they_are_written_and_the_old_ones_kept(site, deployment):

@@ -17,7 +17,7 @@ from companion.config import load_config, parse_config
 from companion.conversions import CameraExtrinsics
 from companion.flight.channels import Channel
 from companion.flight.component_table import COMPONENTS
-from companion.flight.components import Assembly, BuildContext, Component
+from companion.flight.components import Assembly, Component
 from companion.flight.feed import Feed
 from companion.flight.injection import FixInjection
 from companion.inertial import InertialTrack
@@ -75,44 +75,24 @@ def test_a_part_that_cannot_be_made_closes_those_before_it():
     assert log == ["make Lower", "make Upper", "close Lower"]
 
 
-def test_a_part_sees_what_its_line_names_and_nothing_else():
-    def use(making):
-        return making[Lower]
-
+@pytest.mark.parametrize("ask", [Assembly.__getitem__, Assembly.get])
+def test_a_part_that_stands_below_is_asked_later(ask):
     log: list[Any] = []
-    for depends in ((), (Lower,)):
-        parts = [_part(log, Lower), _part(log, Upper, use, depends=depends)]
-        with ExitStack() as up:
-            if depends:
-                Assembly(_config(), parts).make(up)
-                continue
-            with pytest.raises(LookupError, match="'Upper' uses Lower"):
-                Assembly(_config(), parts).make(up)
-
-
-def test_a_part_that_is_asked_later_stands_below():
-    found = []
-
-    def use(making):
-        upper = making.later(Upper)
-        found.append(upper)
-        return Lower()
-
-    log: list[Any] = []
-    parts = [_part(log, Lower, use, later=(Upper,)), _part(log, Upper)]
-    assembly = Assembly(_config(), parts)
+    later = _part(log, Lower, lambda making: (making.later(Upper), Lower())[1])
+    at_once = _part(log, Lower, lambda making: (ask(making, Upper), Lower())[1])
     with ExitStack() as up:
-        assembly.make(up)
-        assert found[0]() is assembly[Upper]
-    with pytest.raises(LookupError, match="depends on Upper"):
-        Assembly(_config(), [_part(log, Lower, depends=(Upper,)), _part(log, Upper)])
+        Assembly(_config(), [later, _part(log, Upper)]).make(up)
+    with ExitStack() as up, pytest.raises(LookupError, match="Upper"):
+        Assembly(_config(), [at_once, _part(log, Upper)]).make(up)
+    with ExitStack() as up, pytest.raises(LookupError, match=r"no component builds .*Upper"):
+        Assembly(_config(), [later]).make(up)
 
 
 def test_what_is_not_wanted_is_not_made():
     log: list[Any] = []
     parts = [
         _part(log, Lower, wanted=lambda config: config.bridge.camera.announce),
-        _part(log, Upper, lambda making: making.get(Lower) or Upper(), depends=(Lower,)),
+        _part(log, Upper, lambda making: making.get(Lower) or Upper()),
     ]
     with ExitStack() as up:
         Assembly(_config(camera={"announce": False}), parts).make(up)
@@ -130,7 +110,6 @@ def test_the_process_starts_and_stops_in_this_order():
     made = [part.name for part in COMPONENTS]
     # A wrong source and a port in use are told before anything is compiled.
     assert made.index("source") < made.index("detections") < made.index("localizer")
-    Assembly(_config(), COMPONENTS)
 
 
 def test_every_subscriber_is_served_though_one_fails():
@@ -150,7 +129,7 @@ def test_every_subscriber_is_served_though_one_fails():
 # --- What the table's parts are made of a deployment as it comes --------------------------------
 
 
-def _given(one: Any, _: BuildContext) -> Any:
+def _given(one: Any, _: Assembly) -> Any:
     return one
 
 

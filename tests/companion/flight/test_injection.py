@@ -30,7 +30,8 @@ from tests.companion.estimates import DOWN, estimated
 LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
 DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
 BRIDGING = TrackingState.BRIDGING
-INSTALLATION = CameraExtrinsics(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zeros(3))
+FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
+EXTRINSICS = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
 
 
 class FakeBridge:
@@ -68,17 +69,18 @@ def _estimate(state, accepted=True):
 )
 def test_only_a_new_start_is_a_jump(states, counts):
     bridge = FakeBridge()
-    injection = FixInjection(bridge, INSTALLATION)
+    injection = FixInjection(bridge, EXTRINSICS)
     for state in states:
         injection.add_estimate(_estimate(state), None)
     assert [fix.reset_count for fix in bridge.fixes] == counts
     sent = [state for state in states if state in (TRACKING, BRIDGING)]
-    assert [fix.by_odometry for fix in bridge.fixes] == [state is BRIDGING for state in sent]
+    scales = [fix.scale_sigma for fix in bridge.fixes]  # a fix of the odometry says so
+    assert scales == [0.2 if state is BRIDGING else None for state in sent]
 
 
 def test_what_is_rejected_or_unconfirmed_is_not_injected():
     bridge = FakeBridge()
-    injection = FixInjection(bridge, INSTALLATION)
+    injection = FixInjection(bridge, EXTRINSICS)
     injection.add_estimate(_estimate(TRACKING, accepted=False), None)
     for state in (INITIALIZING, DEGRADED, LOST):
         injection.add_estimate(_estimate(state), None)
@@ -87,7 +89,7 @@ def test_what_is_rejected_or_unconfirmed_is_not_injected():
 
 def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made():
     bridge, seen, verdicts = FakeBridge(), [], iter([None, "wider", "as it is"])
-    injection = FixInjection(bridge, INSTALLATION)
+    injection = FixInjection(bridge, EXTRINSICS)
 
     def judge(estimate, fix):
         verdict = next(verdicts)
@@ -104,15 +106,6 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
     assert [fix.position_covariance_ned[0, 0] for fix in seen] == pytest.approx([1e-4] * 3)
 
 
-def test_a_fix_of_the_odometry_says_so():
-    bridge = FakeBridge()
-    injection = FixInjection(bridge, INSTALLATION)
-    for state in (TRACKING, BRIDGING):
-        injection.add_estimate(_estimate(state), None)
-    assert [fix.by_odometry for fix in bridge.fixes] == [False, True]
-    assert bridge.fixes[1].scale_sigma == 0.2
-
-
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
     bridge, broken = FakeBridge(), [False]
 
@@ -121,7 +114,7 @@ def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
             raise ZeroDivisionError
         return fix
 
-    injection = FixInjection(bridge, INSTALLATION)
+    injection = FixInjection(bridge, EXTRINSICS)
     injection.add_check(judge)
     for tenth in range(300):
         broken[0] = 100 <= tenth < 130 or (tenth > 200 and tenth % 2 == 0)
@@ -137,32 +130,22 @@ def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
 # --- Which estimates become evidence of the calibration, and what they say ----------------------
 
 
-FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
-EXTRINSICS = CameraExtrinsics(FRAME, 47.0, np.zeros(3))
-
-
-def bundle(depth: np.ndarray) -> Any:
-    return SimpleNamespace(view=SimpleNamespace(depth=depth))
-
-
-def estimate(time_s: float, *, state: str = "TRACKING") -> PoseEstimate:
-    pose = Pose(DOWN, np.array([0.0, 0.0, 80.0]))
-    return estimated(pose, round(time_s * 1e9), variance=0.04, state=TrackingState[state])
-
-
 def test_four_a_second_of_what_the_map_confirmed() -> None:
     taken: list[CalibrationObservation] = []
     observer = CalibrationObserver(EXTRINSICS, taken.append)
 
-    def see(seen: PoseEstimate, depth: np.ndarray) -> None:
-        observer.add_fix(seen, bundle(depth), vision_fix(seen, EXTRINSICS, None, None, 1))
+    def see(time_s: float, depth_m: float = 80.0, state: TrackingState = TRACKING) -> None:
+        pose = Pose(DOWN, np.array([0.0, 0.0, 80.0]))
+        seen = estimated(pose, round(time_s * 1e9), variance=0.04, state=state)
+        view = SimpleNamespace(depth=np.full((240, 320), depth_m, np.float32))
+        bundle: Any = SimpleNamespace(view=view)
+        observer.add_fix(seen, bundle, vision_fix(seen, EXTRINSICS, None, None, 1))
 
-    depth = np.full((240, 320), 80.0, np.float32)
     for tenth in range(1, 21):
-        see(estimate(0.1 * tenth), depth)
+        see(0.1 * tenth)
     assert 6 <= len(taken) <= 8
-    see(estimate(6.0, state="BRIDGING"), depth)
-    see(estimate(7.0), np.zeros((240, 320), np.float32))
+    see(6.0, state=BRIDGING)
+    see(7.0, depth_m=0.0)
     assert taken[-1].time_ns < 5e9
     one = taken[0]
     assert one.place == pytest.approx((47.0, 8.0, 580.0), abs=1e-6)
@@ -213,6 +196,8 @@ def test_the_picture_s_centre_falls_on_the_ground():
     half = math.radians(-45.0) / 2.0
     q = np.array(view.quaternion_ned)
     assert abs(q @ [math.cos(half), 0.0, math.sin(half), 0.0]) == pytest.approx(1.0, abs=1e-6)
+    sky = camera_view(estimate_view_reporter(10.0), FRAME, flat)
+    assert (sky.image_latitude_deg, sky.image_height_m) == (None, None)
 
 
 def test_the_field_of_view_is_that_of_the_zoom():
@@ -220,12 +205,6 @@ def test_the_field_of_view_is_that_of_the_zoom():
     view = camera_view(zoomed, FRAME, flat)
     sent = camera_fov_status(view, CameraConfig(horizontal_fov_deg=60.0), 0.0, 0)
     assert (sent.hfov, sent.vfov) == pytest.approx((20.0, zoomed.camera.vertical_fov_deg))
-
-
-def test_a_look_into_the_sky_has_no_ground():
-    view = camera_view(estimate_view_reporter(10.0), FRAME, flat)
-    assert view.image_latitude_deg is None
-    assert view.image_height_m is None
 
 
 def test_only_the_newest_accepted_estimate_is_told_and_errors_do_not_end_it():

@@ -19,6 +19,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate
 from mavlink_bridge.link.clock import boot_id
+from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import Origin, VehicleState
 from tests.companion.estimates import DOWN, estimated
 
@@ -36,8 +37,19 @@ def kept(tmp_path: Path, fix: LastFix = BEGUN) -> Path:
     return path
 
 
-def memory(path: Path, local: tuple[float, float, float] | None = (13.0, 24.0, -85.0)) -> FixMemory:
-    return FixMemory(path, AUTOPILOT, INSTALLATION, lambda _: local)
+def memory(
+    path: Path,
+    local: tuple[float, float, float] | None = (13.0, 24.0, -85.0),
+    state: VehicleState | None = None,
+) -> FixMemory:
+    return FixMemory(
+        path, AUTOPILOT, INSTALLATION, lambda _: local, state=lambda: state or VehicleState()
+    )
+
+
+@pytest.fixture(autouse=True)
+def written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.flight.last_fix._WRITE_S", 0.01)
 
 
 def tracked(time_ns: int) -> PoseEstimate:
@@ -94,28 +106,9 @@ def test_an_ekf_that_counts_from_elsewhere_shows_no_way(tmp_path, offset_ns, ori
     """
     fix = replace(BEGUN, autopilot_ns=MINUTE, origin=(47.0, 8.0, 453.0))
     state = VehicleState(clock_offset_ns=offset_ns, origin=origin)
-    path = kept(tmp_path, fix)
-    again = FixMemory(
-        path, AUTOPILOT, INSTALLATION, lambda _: (13.0, 24.0, -85.0),
-        state=lambda: state,
-    )  # fmt: skip
+    again = memory(kept(tmp_path, fix), state=state)
     assert (again.prior(103 * SECOND) is not None) is usable
     assert memory(kept(tmp_path)).prior(103 * SECOND) is not None  # a file of an older version
-
-
-def test_where_the_ekf_counts_from_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "last-fix.json"
-    state = VehicleState(clock_offset_ns=40 * SECOND, origin=ORIGIN)
-    kept_on = FixMemory(
-        path, AUTOPILOT, INSTALLATION, lambda _: (1.0, 2.0, 3.0),
-        state=lambda: state,
-    )  # fmt: skip
-    kept_on.start()
-    kept_on.add_estimate(tracked(104 * SECOND), None)  # type: ignore[arg-type]
-    while (found := read_last_fix(path, boot_id())) is None:
-        pass
-    kept_on.stop()
-    assert (found.autopilot_ns, found.origin) == (64 * SECOND, (47.0, 8.0, 453.0))
 
 
 def test_a_flight_that_does_not_end_in_order_leaves_its_place(tmp_path: Path) -> None:
@@ -166,36 +159,34 @@ def test_a_file_of_another_boot_or_without_sense_is_none(tmp_path: Path, content
     assert read_last_fix(path, boot_id()) is None
 
 
-def test_a_file_that_others_may_write_is_none(tmp_path: Path) -> None:
+def test_a_file_that_others_may_write_or_a_pipe_is_none(tmp_path: Path) -> None:
     path = kept(tmp_path)
     assert read_last_fix(path, boot_id()) == BEGUN
     path.chmod(0o666)
     assert read_last_fix(path, boot_id()) is None
     os.remove(path)
     assert read_last_fix(path, boot_id()) is None
+    os.mkfifo(path, 0o600)  # it is not waited for
+    assert read_last_fix(path, boot_id()) is None
 
 
 def test_once_found_the_memory_is_its_own(tmp_path: Path) -> None:
     """And an end in order leaves nothing behind; a kill would."""
     path = kept(tmp_path)
-    kept_on = memory(path, (1.0, 2.0, 3.0))
+    state = VehicleState(clock_offset_ns=40 * SECOND, origin=ORIGIN)
+    kept_on = memory(path, (1.0, 2.0, 3.0), state)
     kept_on.start()
     kept_on.add_estimate(tracked(104 * SECOND), None)  # type: ignore[arg-type]
     assert kept_on.prior(105 * SECOND) is None
-    while (now := read_last_fix(path, boot_id())) == BEGUN:
-        pass
+    assert sleep_until(lambda: read_last_fix(path, boot_id()) != BEGUN, 60.0)
+    now = read_last_fix(path, boot_id())
     assert (now.time_ns, now.local_ned) == (104 * SECOND, (1.0, 2.0, 3.0))
+    assert (now.autopilot_ns, now.origin) == (64 * SECOND, (47.0, 8.0, 453.0))
     assert FRAME.enu_from_geodetic(
         now.latitude_deg, now.longitude_deg, now.height_m
     ) == pytest.approx([5.0, 6.0, 80.0], abs=1e-3)
     kept_on.stop()
     assert not path.exists()
-
-
-def test_a_pipe_in_its_place_is_not_waited_for(tmp_path: Path) -> None:
-    path = tmp_path / "last-fix.json"
-    os.mkfifo(path, 0o600)
-    assert read_last_fix(path, boot_id()) is None
 
 
 def test_what_cannot_be_kept_or_removed_ends_no_flight(tmp_path, caplog):
@@ -204,7 +195,6 @@ def test_what_cannot_be_kept_or_removed_ends_no_flight(tmp_path, caplog):
     kept_on = memory(path)
     kept_on.start()
     kept_on.add_estimate(tracked(104 * SECOND), None)  # type: ignore[arg-type]
-    while "is not kept" not in caplog.text:
-        pass
+    assert sleep_until(lambda: "is not kept" in caplog.text, 60.0)
     kept_on.stop()
     assert "is not removed" in caplog.text

@@ -63,15 +63,10 @@ class Lost:
         return None
 
 
-def test_the_whole_map_is_searched_now_and_then_whatever_was_seen(cache):
+def test_the_whole_map_is_searched_now_and_then_and_where_the_operator_says(cache):
     about = SearchRegion.circle(np.array([10.0, 20.0]), 40.0)
     search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *_: None, lambda _t: about)
     assert [search.region(k) for k in range(10)] == 2 * ([about] * 4 + [None])
-
-
-def test_the_operators_word_comes_before_what_was_seen(cache):
-    about = SearchRegion.circle(np.array([10.0, 20.0]), 40.0)
-    search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *_: None, lambda _t: about)
     search.hint(300.0, 400.0, 50.0)
     assert search.region(0).centre == pytest.approx([300.0, 400.0])
 
@@ -164,14 +159,6 @@ def test_a_place_of_seconds_ago_is_looked_for_again_where_it_can_be_by_now(slowl
     assert slow.queries[1].heading_sigma_rad < slow.queries[0].heading_sigma_rad
 
 
-def test_with_the_autopilots_velocity_the_next_search_is_as_near(slowly):
-    falling = Falling(velocity=np.array([3.0, 0.0, -2.0]))
-    search, slow = slowly(falling)
-    assert search.search(falling.frame(), lambda: False) is None
-    assert search.search(falling.frame(), lambda: False) is not None
-    assert slow.queries[1].region.centre == pytest.approx([12.0, 10.0])
-
-
 def test_a_place_that_is_not_seen_again_is_forgotten(slowly):
     falling = Falling()
     search, slow = slowly(falling)
@@ -240,17 +227,17 @@ def test_a_place_of_long_ago_says_nothing(slowly):
 
 @pytest.mark.parametrize(
     ("jump_m", "centre", "radius_m"),
-    [(0.0, 12.0, 14.0), (60.0, 0.0, 42.0)],
-    ids=["whole", "broken"],
+    [(0.0, 12.0, 14.0), (60.0, 0.0, 42.0), (None, 12.0, 18.0)],
+    ids=["whole record of the IMU", "broken one", "velocity of the EKF"],
 )
-def test_the_imu_narrows_where_it_can_be_while_its_record_holds(slowly, jump_m, centre, radius_m):
+def test_the_next_search_is_as_near_as_the_motion_is_known(slowly, jump_m, centre, radius_m):
     def reach(time_ns):
         t = time_ns * 1e-9
         return SearchRegion.circle(np.array([3.0 * t + jump_m * (t > 1.0), 0.0]), 80.0 + t)
 
-    falling = Falling()
-    search, slow = slowly(falling, reach)
-    search.search(falling.frame(), lambda: False)
+    falling = Falling(np.array([3.0, 0.0, -2.0]) if jump_m is None else None)
+    search, slow = slowly(falling, None if jump_m is None else reach)
+    assert search.search(falling.frame(), lambda: False) is None
     search.search(falling.frame(), lambda: False)
     region = slow.queries[1].region
     assert region.centre[0] == pytest.approx(centre)

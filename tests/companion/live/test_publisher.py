@@ -17,9 +17,8 @@ import pytest
 from companion.console.flight_source import FlightSource
 from companion.errors import CompanionError
 from companion.live.orders import OrderContext, OrderError, Orders
-from companion.live.pace import RateLimiter
 from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
-from companion.live.publisher import Publisher
+from companion.live.publisher import Publisher, RateLimiter
 from companion.live.shared import SharedMemoryReader
 from companion.live.shown import ConsoleData, Instruments
 from localizer.geometry.geo import Geodetic, LocalFrame

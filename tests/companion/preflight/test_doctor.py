@@ -43,13 +43,8 @@ def _findings(map_cache, source, model=MODEL, rate_hz=20.0, **settings):
 def test_a_good_deployment(map_cache, feed):
     findings = _findings(map_cache, feed)
     assert set(findings) == {
-        "map",
-        "map's kind",
-        "map's imagery",
-        "localizer",
-        "camera",
-        "power mode",
-    }
+        "map", "map's kind", "map's imagery", "localizer", "camera", "power mode",
+    }  # fmt: skip
     assert all(findings[name].ok for name in ("map", "localizer", "camera"))
     assert findings["localizer"].found.startswith("tiny (onnxruntime, ")
     assert "numba" in findings["localizer"].found
@@ -134,15 +129,13 @@ def test_a_feed_whose_port_another_has_is_not_called_a_camera_that_is_off(map_ca
 
 def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
     why = "no position by vision on 40 % of the way: build a larger map or move it"
-    diagnosis = Diagnosis(
-        (
-            DoctorFinding("localizer", "tiny (onnxruntime, CPU); numba", "a net", "", True, True),
-            DoctorFinding(
-                "GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False, True
-            ),
-        )
-    )  # fmt: skip
-    print_diagnosis(Console(width=80, force_terminal=False), diagnosis)
+    found = (
+        DoctorFinding("localizer", "tiny (onnxruntime, CPU); numba", "a net", "", True, True),
+        DoctorFinding(
+            "GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False, True
+        ),
+    )
+    print_diagnosis(Console(width=80, force_terminal=False), Diagnosis(found))
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     assert "NOT fit to fly" in lines[0]
@@ -160,12 +153,8 @@ def test_what_was_not_examined_is_said_beside_fit_to_fly(capsys):
 
 
 def test_a_detection_network_that_a_flight_would_not_start_with_is_told(tmp_path):
-    camera = {"source": "udp://127.0.0.1:5600", "model": MODEL}
     (tmp_path / "detector.onnx").write_text("no network")
-    detector = {"model": str(tmp_path / "detector.onnx")}
-    settings = {"map": "none", "camera": camera, "targets": {"detector": detector}}
-    config = parse_config(settings, "test")
-    found = examine_deployment(config, vehicle=False, feed=False).findings
-    (told,) = (f for f in found if f.name == "detector")
+    detector = {"detector": {"model": str(tmp_path / "detector.onnx")}}
+    told = _findings("none", tmp_path / "none", targets=detector)["detector"]
     assert (told.ok, told.required) == (False, True)
     assert "detector.onnx: no ONNX network" in told.why

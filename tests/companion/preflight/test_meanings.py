@@ -105,29 +105,21 @@ def test_a_vehicle_beside_its_map_is_told(cache: TileCache) -> None:
 
 def test_swapped_coordinates_are_named(cache: TileCache) -> None:
     o = cache.manifest.origin
-    swapped = VehicleState(
-        gps_fix_type=3, gps_latitude_deg=o.longitude_deg, gps_longitude_deg=o.latitude_deg
-    )
+    lat, lon = o.latitude_deg, o.longitude_deg
+    swapped = VehicleState(gps_fix_type=3, gps_latitude_deg=lon, gps_longitude_deg=lat)
     (finding,) = check_vehicle_position(cache, swapped)
     assert "latitude and longitude are swapped" in finding.why
-    altitude = o.height_m - cache.manifest.geoid_separation_m
-    right = OriginConfig(
-        latitude_deg=o.latitude_deg, longitude_deg=o.longitude_deg, altitude_amsl_m=altitude
-    )
-    assert check_origin(right, cache).ok
-    wrong = OriginConfig(
-        latitude_deg=o.longitude_deg, longitude_deg=o.latitude_deg, altitude_amsl_m=altitude
-    )
-    assert not check_origin(wrong, cache).ok
-    assert "are swapped" in check_origin(wrong, cache).why
+    amsl_m = o.height_m - cache.manifest.geoid_separation_m
+    for (a, b), ok in (((lat, lon), True), ((lon, lat), False)):
+        origin = OriginConfig(latitude_deg=a, longitude_deg=b, altitude_amsl_m=amsl_m)
+        found = check_origin(origin, cache)
+        assert (found.ok, "are swapped" in found.why) == (ok, not ok)
 
 
 def test_the_other_side_of_the_earth_is_far(cache: TileCache) -> None:
     """In the map's plane it lies under the map."""
     o = cache.manifest.origin
-    state = VehicleState(
-        gps_fix_type=3, gps_latitude_deg=-o.latitude_deg, gps_longitude_deg=o.longitude_deg - 180.0
-    )
-    (finding,) = check_vehicle_position(cache, state)
+    beyond = {"gps_latitude_deg": -o.latitude_deg, "gps_longitude_deg": o.longitude_deg - 180.0}
+    (finding,) = check_vehicle_position(cache, VehicleState(gps_fix_type=3, **beyond))
     assert finding.required
     assert float(finding.found.split()[0]) > 10_000

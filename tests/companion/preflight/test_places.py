@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,36 +31,31 @@ def faults(**settings: Any) -> list[str]:
     return [f.why for f in found]
 
 
-@pytest.mark.parametrize("below", ["x", "x/y/z"])
-def test_a_record_below_a_file_is_told(tmp_path: Path, below: str) -> None:
+@pytest.mark.parametrize(
+    ("key", "value", "why"),
+    [
+        ("record.folder", "file/x", r"^record\.folder .*is not a folder$"),
+        ("record.folder", "file/x/y/z", r"^record\.folder .*is not a folder$"),
+        ("record.folder", "x" * 300, r"record\.folder"),  # a name that no disk takes
+        ("bridge.tlog", "x" * 300, r"bridge\.tlog"),
+        ("bridge.tlog", "", r"^bridge\.tlog .*: a folder, not a file$"),
+        ("bridge.signing.key_file", "none.key", r"bridge\.signing.*none\.key"),
+        ("console.token_file", "/dev/zero", r"^console\.token_file /dev/zero: is no file$"),
+    ],
+)
+def test_what_cannot_be_written_or_read_is_told(tmp_path, key, value, why):
     (tmp_path / "file").write_text("")
-    (why,) = faults(record={"folder": str(tmp_path / "file" / below)})
-    assert why.startswith("record.folder")
-    assert why.endswith("is not a folder")
-
-
-def test_a_name_that_no_disk_takes_is_told(tmp_path: Path) -> None:
-    name = str(tmp_path / ("x" * 300))
-    (record,) = faults(record={"folder": name})
-    (tlog,) = faults(bridge={"tlog": name})
-    assert "record.folder" in record
-    assert "bridge.tlog" in tlog
-
-
-def test_a_folder_in_place_of_a_file_is_told(tmp_path: Path) -> None:
-    (why,) = faults(bridge={"tlog": str(tmp_path)})
-    assert why == f"bridge.tlog {tmp_path}: a folder, not a file"
-
-
-def test_a_signing_key_that_is_not_there_is_told(tmp_path: Path) -> None:
-    (why,) = faults(bridge={"signing": {"key_file": str(tmp_path / "none.key")}})
-    assert "bridge.signing" in why
-    assert "none.key" in why
+    settings: Any = str(tmp_path / value)
+    for name in reversed(key.split(".")):
+        settings = {name: settings}
+    (found,) = faults(**settings)
+    assert re.search(why, found)
 
 
 def test_what_a_start_makes_itself_is_no_fault(tmp_path: Path) -> None:
     create_key(tmp_path / "mavlink.key")
     assert not faults(
+        console={"token_file": str(tmp_path / "mavlink.key")},
         record={"folder": str(tmp_path / "flights/flight")},
         state_dir=str(tmp_path / "state"),
         bridge={
@@ -68,13 +64,6 @@ def test_what_a_start_makes_itself_is_no_fault(tmp_path: Path) -> None:
         },
     )
     assert {path.name for path in tmp_path.iterdir()} == {"mavlink.key"}
-
-
-def test_what_the_page_reads_and_is_no_file_is_told(tmp_path: Path) -> None:
-    (tmp_path / "token").write_text("x")
-    assert not faults(console={"token_file": str(tmp_path / "token")})
-    (why,) = faults(console={"token_file": "/dev/zero"})
-    assert why == "console.token_file /dev/zero: is no file"
 
 
 # --- The doctor's view of the map's heights: right ones pass, each wrong one is seen ------------
@@ -101,31 +90,31 @@ def standing(east=30.0, north=-40.0, geoid_m=SEPARATION_M, above_m=0.0):
     )
 
 
-def test_agreement_is_good(cache):
-    geoid, ground = check_heights(cache, standing(geoid_m=SEPARATION_M + 1.5, above_m=2.0))
-    assert geoid.ok
-    assert ground.ok
+WITHIN, ADVICE, WRONG = (True, False), (False, False), (False, True)  # (ok, required)
+
+
+@pytest.mark.parametrize(
+    ("state", "geoid", "ground"),
+    [
+        (standing(geoid_m=SEPARATION_M + 1.5, above_m=2.0), WITHIN, WITHIN),
+        (standing(geoid_m=SEPARATION_M + 5.0), ADVICE, WITHIN),
+        (standing(geoid_m=SEPARATION_M - 42.5), WRONG, ADVICE),
+        # A map in the wrong datum.
+        (standing(above_m=47.5), WITHIN, ADVICE),
+        (standing(above_m=-47.5), WITHIN, ADVICE),
+        # What is not known is not judged.
+        (VehicleState(), None, None),
+        (replace(standing(), armed=True), WITHIN, None),
+        (standing(east=5000.0), WITHIN, None),  # beside the map
+        (replace(standing(), gps_height_m=None), None, WITHIN),
+    ],
+)
+def test_heights_that_disagree_are_told(cache, state, geoid, ground):
+    found = {f.name: (f.ok, f.required) for f in check_heights(cache, state)}
+    expected = {"geoid": geoid, "take-off height": ground}
+    assert found == {name: told for name, told in expected.items() if told is not None}
+
+
+def test_both_geoids_are_told(cache):
+    geoid, _ = check_heights(cache, standing(geoid_m=SEPARATION_M + 1.5))
     assert geoid.found == "47.5 m in the map, 49.0 m by GNSS"
-
-
-@pytest.mark.parametrize(("error_m", "required"), [(5.0, False), (-42.5, True)])
-def test_another_geoid_is_told(cache, error_m, required):
-    geoid, _ = check_heights(cache, standing(geoid_m=SEPARATION_M + error_m))
-    assert (geoid.ok, geoid.required) == (False, required)
-
-
-@pytest.mark.parametrize("above_m", [47.5, -47.5])
-def test_a_map_in_the_wrong_datum_is_told(cache, above_m):
-    findings = {f.name: f for f in check_heights(cache, standing(above_m=above_m))}
-    assert not findings["take-off height"].ok
-    assert findings["geoid"].ok
-
-
-def test_what_is_not_known_is_not_judged(cache):
-    assert check_heights(cache, VehicleState()) == []
-    state = standing()
-    assert [f.name for f in check_heights(cache, replace(state, armed=True))] == ["geoid"]
-    beside = check_heights(cache, standing(east=5000.0))
-    assert [f.name for f in beside] == ["geoid"]
-    silent = replace(state, gps_height_m=None)
-    assert [f.name for f in check_heights(cache, silent)] == ["take-off height"]

@@ -17,7 +17,7 @@ from companion.config import CompanionConfig, load_config
 from companion.errors import ReportError
 from companion.preflight import bench, self_test
 from companion.preflight.map_pin import map_hash
-from companion.preflight.sheet import PreflightSheet, as_html, as_text, make_sheet, write_sheet
+from companion.preflight.sheet import as_html, as_text, make_sheet, write_sheet
 from localizer.config import LocalizerConfig
 from localizer.map.cache.cache import MANIFEST_NAME
 from mavlink_bridge.preflight.doctor import Diagnosis
@@ -43,23 +43,32 @@ def deployment(tmp_path: Path) -> tuple[Path, CompanionConfig]:
     return path, load_config(path)
 
 
-def rows(sheet: PreflightSheet) -> dict[str, tuple[str, bool | None]]:
+def lines(deployment, findings=(GOOD,), plan=None, now=NOW) -> dict[str, tuple[str, bool | None]]:
+    path, config = deployment
+    sheet = make_sheet(path, config, Diagnosis(tuple(findings)), plan, now)
     return {r.name: (r.text, r.good) for r in sheet.rows}
 
 
-def test_each_line_is_of_its_source(deployment, tmp_path):
-    path, config = deployment
-    plan = tmp_path / "plan.json"
-    legs = [{"name": "1-2", "holds": True}, {"name": "2-3", "holds": False}]
-    config.map.mkdir()
+def planned(deployment, tmp_path: Path, made_over: str | None, **told: object) -> Path:
+    """A plan.json over a map of that hash; "": the deployment's."""
+    _, config = deployment
+    config.map.mkdir(exist_ok=True)
     (config.map / MANIFEST_NAME).write_text("{}")
-    told = {"holds": False, "legs": legs, "conditions": ["dusk"], "mission": "there/a.plan"}
-    plan.write_text(json.dumps(told | {"map_sha256": map_hash(config.map)}))
+    whole = {"holds": True, "legs": [{"name": "1-2", "holds": True}], "mission": "there/a.plan"}
+    sha = map_hash(config.map) if made_over == "" else made_over
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(whole | told | ({} if sha is None else {"map_sha256": sha})))
+    return plan
+
+
+def test_each_line_is_of_its_source(deployment, tmp_path):
+    _, config = deployment
+    legs = [{"name": "1-2", "holds": True}, {"name": "2-3", "holds": False}]
+    plan = planned(deployment, tmp_path, "", holds=False, legs=legs, conditions=["dusk"])
     record = config.record.folder.with_name("day-2")
     record.mkdir(parents=True)
     (record / "health.json").write_text(json.dumps({"shadow": SHADOW}))
-    now = datetime.now(timezone.utc)
-    found = rows(make_sheet(path, config, Diagnosis((GOOD, WRONG)), plan, now))
+    found = lines(deployment, (GOOD, WRONG), plan, datetime.now(timezone.utc))
     assert found["parameters and parts"] == ("1 of 2 checks good; wrong: VISO_TYPE", False)
     assert found["forecast"][0] == "a.plan: vision fails on 1 of 2 legs (dusk): 2-3"
     assert found["shadow score"] == ("ready: 0.4 m for 120 s (day-2, today)", True)
@@ -67,45 +76,38 @@ def test_each_line_is_of_its_source(deployment, tmp_path):
     assert "2026-11-02" in found["calibration"][0]
 
 
-@pytest.mark.parametrize("made_over", ["0" * 64, None])
-def test_a_forecast_over_another_map_says_nothing_of_this_flight(deployment, tmp_path, made_over):
-    path, config = deployment
-    config.map.mkdir()
-    (config.map / MANIFEST_NAME).write_text("{}")
-    plan = tmp_path / "plan.json"
-    told = {"holds": True, "legs": [{"name": "1-2", "holds": True}], "mission": "a.plan"}
-    for sha, good in ((map_hash(config.map), True), (made_over, False)):
-        plan.write_text(json.dumps(told | ({} if sha is None else {"map_sha256": sha})))
-        text, marked = rows(make_sheet(path, config, Diagnosis((GOOD,)), plan, NOW))["forecast"]
-        assert marked is good
-        assert ("made over another map" in text) is not good
+@pytest.mark.parametrize(("made_over", "good"), [("", True), ("0" * 64, False), (None, False)])
+def test_a_forecast_over_another_map_says_nothing_of_this_flight(
+    deployment, tmp_path, made_over, good
+):
+    text, marked = lines(deployment, plan=planned(deployment, tmp_path, made_over))["forecast"]
+    assert marked is good
+    assert ("made over another map" in text) is not good
 
 
 def test_a_score_over_another_map_is_marked(deployment):
-    path, config = deployment
+    _, config = deployment
     record = config.record.folder
     record.mkdir(parents=True)
     (record / "health.json").write_text(json.dumps({"shadow": SHADOW}))
     for flown, good in ((str(config.map), True), ("/maps/valley", False)):
         (record / "record.json").write_text(json.dumps({"config": {"map": flown}}))
-        sheet = make_sheet(path, config, Diagnosis((GOOD,)), None, datetime.now(timezone.utc))
-        text, marked = rows(sheet)["shadow score"]
+        text, marked = lines(deployment, now=datetime.now(timezone.utc))["shadow score"]
         assert marked is good
         assert text.endswith("over another map") is not good
 
 
 def test_what_is_old_or_lacks_is_marked(deployment):
     path, config = deployment
-    recent = rows(make_sheet(path, config, Diagnosis((GOOD,)), None, NOW))
+    recent = lines(deployment)
     assert recent["calibration"][0].startswith("2026-11-02 (20 days ago)")
     assert recent["calibration"][1] is True
-    later = rows(make_sheet(path, config, Diagnosis((GOOD,)), None, NOW.replace(year=2027)))
-    assert later["calibration"][1] is False
+    assert lines(deployment, now=NOW.replace(year=2027))["calibration"][1] is False
     never = config.camera.model_copy(update={"calibrated": None})
-    none = make_sheet(path, config.model_copy(update={"camera": never}), Diagnosis(()), None, NOW)
-    assert rows(none)["calibration"][1] is False
-    assert rows(none)["shadow score"] == ("none: fly in shadow mode first", False)
-    assert rows(none)["parameters and parts"][1] is False
+    none = lines((path, config.model_copy(update={"camera": never})), ())
+    assert none["calibration"][1] is False
+    assert none["shadow score"] == ("none: fly in shadow mode first", False)
+    assert none["parameters and parts"][1] is False
 
 
 def test_the_page_escapes_and_says_unfit(deployment, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -92,6 +93,7 @@ class Watch:
         self.told: list[tuple[StreamState, str]] = []
         self.error: Exception | None = None
         self.strangers: list[str] = []
+        self._news = threading.Condition()
         self.source: FrameSource = open_source(
             url,
             camera,
@@ -118,21 +120,35 @@ class Watch:
         """What was told first with a state."""
         return next(text for s, text in list(self.told) if s is state)
 
-    def wait_for(self, count: int, timeout_s: float = 60.0) -> None:
-        self.wait_until(lambda: len(self.frames) >= count, timeout_s)
+    def wait_for(self, count: int) -> None:
+        self.wait_until(lambda: len(self.frames) >= count)
 
-    def wait_until(self, condition: object, timeout_s: float = 60.0) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not condition():  # type: ignore[operator]
-            assert time.monotonic() < deadline, (len(self.frames), self.told)
-            time.sleep(0.02)
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        assert self.comes_true(condition, 60.0), (len(self.frames), self.told)
+
+    def comes_true(self, condition: Callable[[], bool], within_s: float) -> bool:
+        """Whether it holds after a frame or a state that comes by then."""
+        with self._news:
+            return self._news.wait_for(condition, within_s)
+
+    def shows(self, number: int, within_s: float) -> bool:
+        """Whether that picture comes out by then."""
+        return self.comes_true(
+            lambda: bool(self.frames) and read_counter(self.frames[-1][0].image) == number, within_s
+        )
 
     def _run(self) -> None:
         try:
             for frame in self.source.frames():
-                self.frames.append((frame, time.monotonic_ns()))
+                with self._news:
+                    self.frames.append((frame, time.monotonic_ns()))
+                    self._news.notify_all()
         except Exception as error:
-            self.error = error
+            with self._news:
+                self.error = error
+                self._news.notify_all()
 
     def _on_state(self, state: StreamState, text: str) -> None:
-        self.told.append((state, text))
+        with self._news:
+            self.told.append((state, text))
+            self._news.notify_all()

@@ -138,12 +138,18 @@ def test_another_size_of_the_same_shape_scales_the_camera(kind, request):
     assert "160x120" in told[1][1]
 
 
-@pytest.mark.parametrize(("width", "height"), [(1920, 1088), (960, 720), (1280, 1024)])
-def test_a_padded_or_cropped_picture_is_no_scaled_one(width: int, height: int) -> None:
-    camera = Camera.from_fov(1920, 1080, 70.0)
-    with pytest.raises(StreamSizeError):
-        fitted_camera(width, height, camera, "camera")
-    assert fitted_camera(854, 480, camera, "camera").width == 854
+@pytest.mark.parametrize(
+    ("size", "model"),
+    [
+        ((1920, 1088), (1920, 1080)), ((960, 720), (1920, 1080)), ((1280, 1024), (1920, 1080)),
+        ((8, 6), (640, 480)), ((1, 1), (640, 480)),
+    ],
+)  # fmt: skip
+def test_a_padded_cropped_or_tiny_picture_is_no_scaled_one(size, model):
+    camera = Camera.from_fov(*model, 70.0)
+    with pytest.raises(StreamSizeError, match=f"camera delivers {size[0]}x{size[1]}"):
+        fitted_camera(*size, camera, "camera")
+    assert fitted_camera(model[0] // 2, model[1] // 2, camera, "camera").width == model[0] // 2
 
 
 def test_timestamps_are_used_as_they_stand(folder: Path) -> None:

@@ -60,10 +60,11 @@ def test_no_start_code_appears_in_a_stamp(time_us: int) -> None:
                    for i in range(len(message) - 2))  # fmt: skip
 
 
-def test_other_sei_messages_are_not_stamps() -> None:
-    assert parse_message(b"x264 - core 164" + bytes(40)) is None
-    assert parse_message(UUID + b"\x1f" + bytes(11)) is None
-    assert parse_message(UUID) is None
+@pytest.mark.parametrize(
+    "message", [b"x264 - core 164" + bytes(40), UUID + b"\x1f" + bytes(11), UUID]
+)
+def test_other_sei_messages_are_not_stamps(message: bytes) -> None:
+    assert parse_message(message) is None
 
 
 def test_the_smallest_lag_finds_the_senders_clock_under_jitter() -> None:
@@ -93,12 +94,26 @@ def test_a_sender_that_starts_again_is_taken_up_at_once() -> None:
     assert clock.map(100 * 10**9, 102 * 10**9) == 102 * 10**9
 
 
-def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not(clocks):
-    now = clocks.now_ns
-    clock = ExposureClock(latency_ns=90 * MS)
-    misp = MispTime((now - 60 * MS + clocks.offset_ns) // 1000, locked=True)
-    exposed = clock.exposure_time(FrameTimestamps(pts_ns=7, misp=misp), now)
-    assert exposed == pytest.approx(now - 60 * MS, abs=0.1 * MS)
+def _locked_misp(clocks: Clocks) -> MispTime:
+    return MispTime((clocks.now_ns - 60 * MS + clocks.offset_ns) // 1000, locked=True)
+
+
+@pytest.mark.parametrize(
+    ("pts", "misp", "device", "age_ms"),
+    [
+        # A locked MISP stamp is taken as it is, and the latency setting is not.
+        (lambda _: 7, _locked_misp, False, 60),
+        # Device stamps on the monotonic clock are exposure times, those on the wall clock are not.
+        (lambda c: c.now_ns - 25 * MS, lambda _: None, True, 25),
+        (lambda c: c.time_ns(), lambda _: None, True, 30),
+        # Without any stamp the arrival less the latency is left.
+        (lambda _: None, lambda _: None, False, 30),
+    ],
+)
+def test_the_best_stamp_gives_the_exposure(clocks, pts, misp, device, age_ms):
+    now, clock = clocks.now_ns, ExposureClock(latency_ns=30 * MS, device=device)
+    exposed = clock.exposure_time(FrameTimestamps(pts(clocks), misp(clocks)), now)
+    assert now - exposed == pytest.approx(age_ms * MS, abs=0.1 * MS)
 
 
 @pytest.mark.parametrize(
@@ -114,19 +129,6 @@ def test_a_misp_clock_that_is_not_ours_gives_differences_only(clocks, offset_ns,
         result = clock.exposure_time(stamps, true + lag * MS)
         assert result == pytest.approx(true, abs=0.2 * MS)
     assert caplog.text.count("MISP clock") == 1
-
-
-def test_device_stamps_on_the_monotonic_clock_are_exposure_times(clocks: Clocks) -> None:
-    now = clocks.now_ns
-    clock = ExposureClock(latency_ns=30 * MS, device=True)
-    assert clock.exposure_time(FrameTimestamps(now - 25 * MS, None), now) == now - 25 * MS
-    wall_clock = FrameTimestamps(clocks.time_ns(), None)
-    assert clock.exposure_time(wall_clock, now) == now - 30 * MS
-
-
-def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
-    clock = ExposureClock(latency_ns=30 * MS)
-    assert clock.exposure_time(FrameTimestamps(None, None), 10**12) == 10**12 - 30 * MS
 
 
 @pytest.mark.parametrize("step_s", [0.0, 0.3, -0.1])
@@ -167,14 +169,11 @@ def test_a_camera_that_loses_its_reference_keeps_its_times(clocks: Clocks) -> No
             assert exposed == pytest.approx(now - lag, abs=0.2 * MS)
 
 
-def test_another_thread_between_two_readings_of_the_clocks_costs_nothing(clocks: Clocks) -> None:
-    clocks.waits_ns = [50 * MS, 7 * MS]
-    assert system_minus_monotonic() == pytest.approx(clocks.offset_ns, abs=2000)
-
-
-def test_the_closest_readings_count_where_none_are_close(clocks: Clocks) -> None:
-    clocks.waits_ns = [50 * MS, 7 * MS, MS, 9 * MS, 20 * MS]
-    assert system_minus_monotonic() == pytest.approx(clocks.offset_ns, abs=0.51 * MS)
+@pytest.mark.parametrize(("waits_ms", "off_ns"), [([50, 7], 2000), ([50, 7, 1, 9, 20], 0.51 * MS)])
+def test_another_thread_between_two_readings_costs_little(clocks, waits_ms, off_ns):
+    """Nothing where two of five are close; where none are, the closest count."""
+    clocks.waits_ns = [wait * MS for wait in waits_ms]
+    assert system_minus_monotonic() == pytest.approx(clocks.offset_ns, abs=off_ns)
 
 
 @pytest.mark.parametrize("device", [False, True])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -44,29 +45,16 @@ def kept() -> Iterator[Callable[[CompanionConfig], int]]:
         os.close(descriptor)
 
 
-def _gone(path: Path) -> None:
-    path.unlink()
-
-
-def _no_file_any_more(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def _half_written(path: Path) -> None:
-    path.write_text(path.read_text()[:40])
-
-
-def _another_programs(path: Path) -> None:
-    path.write_bytes(b"\x00\xff" * 9)
-
-
-@pytest.mark.parametrize("lose", [_gone, _no_file_any_more, _half_written, _another_programs])
-def test_a_lost_file_costs_nothing_in_the_air_and_ends_a_first_start(deployment, kept, lose):
+@pytest.mark.parametrize("left", [None, b"", b"map: area\ncamera: {model: {wid", b"\x00\xff" * 9])
+def test_a_lost_file_costs_nothing_in_the_air_and_ends_a_first_start(deployment, kept, left):
     """Each restart ended with it, and none ever flew again."""
     flown = load_config(deployment)
     descriptor = kept(flown)
-    lose(deployment)
+    deployment.unlink()
+    if left is None:
+        deployment.mkdir()  # no file any more
+    elif left:
+        deployment.write_bytes(left)  # half written, or another program's
     for _ in range(2):  # of many restarts each reads it from its begin
         again, why = settings_of(deployment, descriptor)
         assert again == flown
@@ -82,20 +70,12 @@ def test_a_file_that_is_there_counts(deployment, kept):
     assert (again.map, why) == (deployment.parent / "other", "")
 
 
-def test_every_setting_comes_back(kept: Callable[[CompanionConfig], int], tmp_path: Path) -> None:
-    flown = load_config(SHIPPED)
-    assert settings_of(tmp_path / "gone.yaml", kept(flown))[0] == flown
-
-
-def test_a_folder_whose_name_is_no_utf8_is_kept(deployment, kept):
+def test_every_setting_comes_back_from_a_folder_whose_name_is_no_utf8(kept, tmp_path):
     """No supervised flight began there."""
-    folder = Path(os.fsdecode(os.fsencode(deployment.parent) + b"/fl\xfcge"))
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/fl\xfcge"))
     folder.mkdir()
-    moved = deployment.rename(folder / deployment.name)
-    flown = load_config(moved)
-    descriptor = kept(flown)
-    moved.unlink()
-    assert settings_of(moved, descriptor)[0] == flown
+    flown = load_config(Path(shutil.copy(SHIPPED, folder)))
+    assert settings_of(folder / "gone.yaml", kept(flown))[0] == flown
 
 
 def test_it_takes_no_standard_streams_place(deployment, kept):
