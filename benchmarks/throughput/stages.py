@@ -41,8 +41,9 @@ class Watch:
             self.spent[stage] += 1e3 * (time.process_time() - began)
 
 
-class _Renderer:
+class _Renderer(MapRenderer):
     def __init__(self, base: MapRenderer, watch: Watch) -> None:
+        super().__init__(base.streamer)
         self._base, self._watch, self.name = base, watch, base.name
 
     def render(
@@ -56,11 +57,10 @@ class _Renderer:
         with self._watch.of("render"):
             return self._base.render(world_from_camera, camera, extra, wait=wait)
 
-    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        self._base.prefetch(views, camera)
-
-    def warm_up(self) -> None:
-        self._base.warm_up()
+    def draw(
+        self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
+    ) -> RenderedView:
+        return self._base.draw(meshes, world_from_camera, camera)
 
     def close(self) -> None:
         self._base.close()

@@ -26,8 +26,6 @@ HOLE_CELL_M = 1.0
 MIN_HOLE_M2 = 25.0  # smaller gaps are ponds, glass roofs and other failures of photogrammetry
 _MAX_CELLS = 20_000 * 20_000
 
-# Camera axes (x right, y down, z forward) of a camera that looks along the body's x (FRD).
-
 
 @dataclass(frozen=True)
 class LevelSummary:
