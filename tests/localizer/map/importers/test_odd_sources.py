@@ -30,6 +30,7 @@ from localizer.map.importers.georeference import Georeference, read_georeference
 from localizer.map.importers.raster_checks import check_heights
 from localizer.map.importers.raster_file import METRES, offline, open_raster, require_sane
 from localizer.map.importers.rules import ImportRules, require_plain_file
+from localizer.map.importers.tiles3d import read_tileset
 from tests.localizer.map.conftest import ORIGIN as TILESET_ORIGIN
 from tests.localizer.map.conftest import PLACE, leaf_meshes, write_raster, write_tree
 from tests.localizer.map.fetch.loopback import serving
@@ -636,6 +637,13 @@ def test_no_name_makes_gdal_fetch_anything(tmp_path):
 def test_what_a_process_does_is_a_named_error_here(what, limits, says):
     with pytest.raises(MapSourceError, match=says):
         call_in_process(*what, rules=ImportRules(**limits), what="its part")
+
+
+def test_a_deep_tree_comes_back_from_its_process(tmp_path, make):
+    rules = ImportRules(depth=300)
+    source = deep_tileset(tmp_path, make)
+    tree = call_in_process(read_tileset, source, rules, rules=rules, what="its part")
+    assert sum(1 for _ in tree.root.walk()) == 252
 
 
 def test_limits_and_doubts_are_named():
