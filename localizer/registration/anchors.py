@@ -33,9 +33,8 @@ def select_anchors(
     rng = np.random.default_rng(seed)
     rows, columns = _candidates(view.depth, rng)
     side = np.sqrt(view.depth.size / max(count, 1))
-    cell = (rows // side).astype(np.int64) * view.depth.shape[1] + (columns // side).astype(
-        np.int64
-    )
+    row, column = ((np.arange(n) // side).astype(np.int64) for n in view.depth.shape)
+    cell = row[rows] * view.depth.shape[1] + column[columns]
     picked = _stratified(cell, count, rng)
     rows, columns = rows[picked], columns[picked]
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)

@@ -81,12 +81,17 @@ class Undistorter:
 
     def __init__(self, source: Camera, target: Camera) -> None:
         self.source, self._target = source, target
-        # Shrinking by more than 2 under bilinear sampling aliases: average down to twice the
-        # target first, undistort there, and average again.
-        double = (2 * target.width, 2 * target.height)
-        shrinks = source.width > double[0]
-        self._middle = source.resized(*double) if shrinks else source
-        pinhole = target.resized(self._middle.width, self._middle.height)
+        # Shrinking by more than 2 under bilinear sampling aliases: average before and after the
+        # undistortion. OpenCV averages whole numbers of pixels ten times as fast, two the fastest.
+        self._middle, times = source, source.width // (2 * target.width)
+        while times > 1:
+            self._middle = source.resized(self._middle.width // 2, self._middle.height // 2)
+            times //= 2
+        size = (self._middle.width, self._middle.height)
+        if source.width > 2 * target.width:
+            whole = round(self._middle.width / target.width)
+            size = (whole * target.width, whole * target.height)
+        pinhole = target.resized(*size)
         bent = not self._middle.is_like(pinhole)  # by its lens, or by its zoom
         self._maps = self._middle.undistortion_maps(pinhole) if bent else None
         self.seen = self._seen()
@@ -114,16 +119,18 @@ class Undistorter:
                 f"frame {frame.sequence} is {width}x{height}, the camera model says "
                 f"{self.source.width}x{self.source.height}: give this stream's calibration"
             )
-        image = _shrink(frame.image, self._middle)
+        image = frame.image
+        while image.shape[1] > self._middle.width:
+            image = _shrink(image, (image.shape[1] // 2, image.shape[0] // 2))
         if self._maps is not None:
             image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-        return _shrink(image, self._target)
+        return _shrink(image, (self._target.width, self._target.height))
 
 
-def _shrink(image: Image, camera: Camera) -> Image:
-    if image.shape[:2] == (camera.height, camera.width):
+def _shrink(image: Image, size: tuple[int, int]) -> Image:
+    if image.shape[1::-1] == size:
         return image
-    resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     shrunk: Image = resized.astype(np.uint8, copy=False)
     return shrunk
 

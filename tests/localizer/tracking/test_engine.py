@@ -378,7 +378,7 @@ def test_features_of_a_reference_do_not_see_the_maps_holes():
     assert len(anchors.points_world) > 0
 
 
-@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1024, 768)])
+@pytest.mark.parametrize("size", [(640, 480), (1024, 768), (1280, 720), (1920, 1080), (2704, 1520)])
 def test_undistorted_image_agrees_with_the_projection(size):
     """A dot drawn where the distorted camera sees a point is found where the pinhole sees it."""
     camera = Camera(size[0], size[1], 0.8 * size[0], 0.8 * size[0], 0.51 * size[0], 0.49 * size[1],
