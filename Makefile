@@ -9,6 +9,9 @@ LOCK := constraints.txt
 INSTALL = PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
 EXTRAS := cluster console dev docs fetch mcap openvino pyrender ulog
 
+# OpenVINO is faster than onnxruntime only where the processor computes in bfloat16.
+BFLOAT16 := $(shell grep -qsE 'amx_bf16|avx512_bf16' /proc/cpuinfo && echo ,openvino)
+
 CHECKED := tests/test_house.py tests/test_docs_commands.py tests/companion/test_config.py \
 	tests/localizer/geometry tests/localizer/integrity tests/companion/integrity_monitor \
 	tests/companion/calibration_watch tests/mavlink_bridge/injection tests/mavlink_bridge/link \
@@ -51,7 +54,7 @@ $(BIN)/python:
 
 $(VENV)/.demo: $(BIN)/python pyproject.toml $(LOCK)
 	@echo "installing what the program needs into $(VENV), minutes the first time"
-	$(INSTALL) --editable '.[console]'
+	$(INSTALL) --editable '.[console$(BFLOAT16)]'
 	touch $@
 
 # Most of what is installed is never imported: what is, Python compiles then.

@@ -8,21 +8,31 @@ import codecs
 import errno
 import os
 import stat
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 
 MOST_BYTES = 1 << 28  # of text and pictures; what is longer is another file, given by mistake
 
 
-def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
-    """Content of a plain file. most: size limit in bytes; None: no limit.
-
-    OSError for a pipe, which may block the reader, for a device, which may have no end, and for
-    more than `most` bytes.
+@contextmanager
+def open_plain(path: Path) -> Iterator[BufferedReader]:
+    """A plain file, opened for reading. OSError for a pipe, which may block the reader, and for a
+    device, which may have no end.
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "is not a plain file", str(path))
+        yield file
+
+
+def plain_bytes(path: Path, most: int | None = MOST_BYTES) -> bytes:
+    """Content of a plain file. most: size limit in bytes; None: no limit.
+
+    OSError as `open_plain`, and for more than `most` bytes.
+    """
+    with open_plain(path) as file:
         data = file.read(-1 if most is None else most + 1)
     if most is not None and len(data) > most:
         raise OSError(errno.EFBIG, f"is larger than {most >> 20} MiB", str(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
@@ -15,7 +15,7 @@ from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.components import COMMANDS_IN, Components
-from mavlink_bridge.config import BridgeConfig, SigningConfig
+from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, message_id
 from mavlink_bridge.ground import GroundEnd
@@ -25,13 +25,8 @@ from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import Link, LinkHandler, LinkOptions
-from mavlink_bridge.link.replay import ReplayWindow
-from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
-from mavlink_bridge.link.transport import (
-    Endpoint,
-    parse_sender,
-)
+from mavlink_bridge.link.transport import Endpoint, parse_sender
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -120,16 +115,15 @@ class Bridge:
             clock,
         )
         self._fc = FlightControllerEnd(shared)
-        make = _LinkMaker(config, self._recorder)
-        self._fc_link = make(config.connection, self._fc, "fc", FC_WANTED, config.signing)
+        self._fc_link = _link(config, config.connection, self._fc, "fc", self._recorder)
         # Without a ground link of its own, what is for the ground is routed by the autopilot.
         self._ground: Components = self._fc.components
         self._ground_link = self._fc_link
         if config.ground_connection is not None:
             ground = GroundEnd(shared)
             self._ground = ground.components
-            self._ground_link = make(
-                config.ground_connection, ground, "ground", _GROUND_WANTED, config.ground_signing
+            self._ground_link = _link(
+                config, config.ground_connection, ground, "ground", self._recorder
             )
         self._links = tuple(dict.fromkeys((self._fc_link, self._ground_link)))
         self._cot = None
@@ -142,7 +136,7 @@ class Bridge:
         """Before `start`, set the id of the map. A stored failure of the shadow check over another
         map is ignored.
         """
-        self._fc.set_map_id(map_id)
+        self._fc.interlock.set_map_id(map_id)
 
     def start(self) -> None:
         """Open the links and restore a killed process's state; `BridgeStateError` if repeated."""
@@ -153,7 +147,7 @@ class Bridge:
             self._recorder.start()
         if self._shared.enable is not None:
             self._shared.enable.recall()  # before a link finds the vehicle and has it announced
-        self._fc.recall()
+        self._fc.interlock.recall()
         for link in self._links:
             link.start()
 
@@ -171,7 +165,7 @@ class Bridge:
         """Call before `stop` if another process takes over: the state for a restart is kept."""
         if self._shared.enable is not None:
             self._shared.enable.stop(clean_shutdown=False)
-        self._fc.end(clean_shutdown=False)
+        self._fc.interlock.end(clean_shutdown=False)
 
     def stop(self) -> None:
         """Close links, sockets and the .tlog, and delete the state for a restart (see `hand_over`).
@@ -184,7 +178,7 @@ class Bridge:
             self._shared.enable.stop()
         for link in self._links:
             link.stop()
-        self._fc.end()
+        self._fc.interlock.end()
         if self._cot is not None:
             self._cot.close()
         if self._recorder is not None:
@@ -332,9 +326,8 @@ class Bridge:
         """Positions of the vehicle's mission; () until they are known. The first call starts the
         download, in the link's thread; a changed mission is downloaded again.
         """
-        mission = self._fc.requests.mission
-        mission.wanted = True
-        return mission.waypoints
+        self._fc.mission.wanted = True
+        return self._fc.mission.waypoints
 
     def alerts(self) -> list[Alert]:
         """The last 64 alerts that were reported, oldest first; also those that have ended."""
@@ -393,47 +386,29 @@ class Bridge:
         result["ekf_source_set"] = self._fc.sources.current
         return result
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of messages, samples or bytes that each queue holds, by its name."""
-        result = {"alerts": len(self._status.alerts()), **self._fc.queue_lengths()}
-        if self._ground is not self._fc.components:
-            result.update({f"ground {name}": n for name, n in self._ground.queue_lengths().items()})
-        for link in self._links:
-            result.update({f"{link.name} {name}": n for name, n in link.queue_lengths().items()})
-        return result
 
-
-@dataclass(frozen=True)
-class _LinkMaker:
-    """Creates both links of a bridge: to the autopilot ("fc") and to the ground."""
-
-    config: BridgeConfig
-    recorder: TlogRecorder | None
-
-    def __call__(
-        self,
-        connection: str,
-        handler: LinkHandler,
-        name: str,
-        wanted: frozenset[int],
-        signing: SigningConfig | None,
-    ) -> Link:
-        config = self.config
-        key = None if signing is None else load_key(signing.key_file)
-        is_fc = name == "fc"
-        options = LinkOptions(
-            name=name,
-            wanted=wanted,
-            signing_key=key,
-            sender=parse_sender(config.sender) if is_fc and config.sender else None,
-            # A signature says more of who speaks than an address does.
-            follow_hosts_after_s=None if is_fc and key is None else _NEXT_STATION_S,
-            window=None if signing is None else ReplayWindow(signing.state_path(name)),
-            signing_link_id=1 if signing is None else signing.link_id,
-            recorder=self.recorder,
-            timeout_s=config.link_timeout_s,
-        )
-        return Link(Endpoint.parse(connection), handler, options)
+def _link(
+    config: BridgeConfig,
+    connection: str,
+    handler: LinkHandler,
+    name: str,
+    recorder: TlogRecorder | None,
+) -> Link:
+    """The link to the autopilot ("fc") or to the ground ("ground")."""
+    is_fc = name == "fc"
+    signing = config.signing if is_fc else config.ground_signing
+    options = LinkOptions(
+        name=name,
+        wanted=FC_WANTED if is_fc else _GROUND_WANTED,
+        signing=signing,
+        remembers=True,
+        sender=parse_sender(config.sender) if is_fc and config.sender else None,
+        # A signature says more of who speaks than an address does.
+        follow_hosts_after_s=None if is_fc and signing is None else _NEXT_STATION_S,
+        recorder=recorder,
+        timeout_s=config.link_timeout_s,
+    )
+    return Link(Endpoint.parse(connection), handler, options)
 
 
 def _enable(config: BridgeConfig, notifier: StatusNotifier) -> InjectionEnable | None:

@@ -76,10 +76,6 @@ class Components:
         """Queue an item for the ground station; the oldest is dropped if the queue is full."""
         self._outbound.append(item)
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of entries in each queue, by name."""
-        return {"outbound": len(self._outbound), "targets": self._camera.targets}
-
     def announce(self) -> None:
         """Send the next heartbeat at once, because the link was opened."""
         self._next_heartbeat_ns = 0

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from mavlink_bridge.errors import EndpointError
+from mavlink_bridge.link.transport import Endpoint, parse_sender
 
 InjectionMessage = Literal[
     "vision_position_estimate",
@@ -198,7 +202,7 @@ class TargetsConfig(StrictModel):
     @classmethod
     def _is_host_and_port(cls, value: str) -> str:
         if value:
-            _check_endpoint(f"udpout:{value}", "write host:port")
+            _check(Endpoint.parse, f"udpout:{value}", "write host:port")
         return value
 
 
@@ -299,85 +303,58 @@ class BridgeConfig(StrictModel):
     @classmethod
     def _connection_is_an_endpoint(cls, value: str | None) -> str | None:
         if value is not None:
-            _check_endpoint(value)
+            _check(Endpoint.parse, value)
         return value
 
     @field_validator("sender")
     @classmethod
     def _is_a_sender(cls, value: str | None) -> str | None:
         if value is not None:
-            from mavlink_bridge.errors import EndpointError
-            from mavlink_bridge.link.transport import parse_sender
-
-            try:
-                parse_sender(value)
-            except EndpointError as error:
-                raise ValueError(str(error)) from error
+            _check(parse_sender, value)
         return value
 
     @model_validator(mode="after")
-    def _state_files_differ(self) -> BridgeConfig:
+    def _parts_fit(self) -> BridgeConfig:
         first, second = self.signing, self.ground_signing
         if first and second and first.state_path("fc") == second.state_path("ground"):
             raise ValueError("signing and ground_signing need a state_file each")
-        return self
-
-    @model_validator(mode="after")
-    def _message_has_a_source_set(self) -> BridgeConfig:
         message = self.injection.message
         if self.switch.enabled and message in WITHOUT_SOURCE_SET:
             raise ValueError(
                 f"{message} is fused beside GNSS and has no source set: remove switch.enabled"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _links_and_components_differ(self) -> BridgeConfig:
-        if self.ground_connection == self.connection:
-            raise ValueError("ground_connection is the flight controller's; leave it empty")
         components = (self.localizer_component, self.companion_component, self.camera_component)
         if len(set(components)) < 3:
             raise ValueError("localizer, companion and camera need a component id each")
-        return self
-
-    @model_validator(mode="after")
-    def _sender_is_of_udpin(self) -> BridgeConfig:
-        if self.sender is not None and not self.connection.startswith("udpin:"):
-            raise ValueError(
-                f"sender chooses among the senders of a udpin connection; {self.connection} has "
-                "one peer: remove it"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _autopilots_texts_need_a_ground_link(self) -> BridgeConfig:
-        if self.texts_as_autopilot and self.ground_connection is None:
-            raise ValueError(
-                "texts_as_autopilot needs ground_connection: ArduPilot drops what comes back to it "
-                "under its own ids"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _aircraft_needs_a_listener(self) -> BridgeConfig:
         if self.targets.cot_aircraft and not self.targets.cot_endpoint:
             raise ValueError("targets.cot_aircraft needs targets.cot_endpoint, host:port")
         return self
 
     @model_validator(mode="after")
-    def _adsb_needs_a_ground_link(self) -> BridgeConfig:
-        if self.targets.adsb and self.ground_connection is None:
+    def _links_fit(self) -> BridgeConfig:
+        if self.ground_connection == self.connection:
+            raise ValueError("ground_connection is the flight controller's; leave it empty")
+        if self.sender is not None and not self.connection.startswith("udpin:"):
+            raise ValueError(
+                f"sender chooses among the senders of a udpin connection; {self.connection} has "
+                "one peer: remove it"
+            )
+        if self.ground_connection is not None:
+            return self
+        if self.texts_as_autopilot:
+            raise ValueError(
+                "texts_as_autopilot needs ground_connection: ArduPilot drops what comes back to it "
+                "under its own ids"
+            )
+        if self.targets.adsb:
             raise ValueError(
                 "targets.adsb needs ground_connection: ArduPilot ingests ADSB_VEHICLE as traffic"
             )
         return self
 
 
-def _check_endpoint(text: str, hint: str = "") -> None:
-    from mavlink_bridge.errors import EndpointError
-    from mavlink_bridge.link.transport import Endpoint
-
+def _check(parse: Callable[[str], object], text: str, hint: str = "") -> None:
     try:
-        Endpoint.parse(text)
+        parse(text)
     except EndpointError as error:
         raise ValueError(hint or str(error)) from error

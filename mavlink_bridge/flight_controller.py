@@ -13,25 +13,24 @@ from mavlink_bridge.alerts.catalogue import CATALOGUE, alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
-from mavlink_bridge.config import WITHOUT_SOURCE_SET, BridgeConfig, Mode
+from mavlink_bridge.config import WITHOUT_SOURCE_SET, Mode
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
 from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.outcome import InjectionOutcome
-from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import ShadowScore
-from mavlink_bridge.injection.switching import SourceOrders
+from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Figures, VehicleState
 from mavlink_bridge.place_hint import PLACE_HINT
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander, is_accepted
-from mavlink_bridge.vehicle.mission import MISSION_IN
+from mavlink_bridge.vehicle.mission import MISSION_IN, MissionWatch
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
 from mavlink_bridge.vehicle.readings import MESSAGES_IN
-from mavlink_bridge.vehicle.requests import VehicleRequests
+from mavlink_bridge.vehicle.streams import StreamKeeper
 from mavlink_bridge.vehicle.timesync import TimeSync
 from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
 from mavlink_bridge.vehicle_events import VehicleEvents
@@ -59,11 +58,6 @@ FC_WANTED = frozenset(
 )
 
 
-def _no_go_memory(config: BridgeConfig) -> ShadowFailureMemory | None:
-    file = config.state_file
-    return None if file is None else ShadowFailureMemory(file.with_name("shadow-no-go.json"))
-
-
 class FlightControllerEnd:
     """Handles the flight controller's link, in its thread. Other threads call only `sender.put`,
     `inhibit`, `clear`, and what reads its state.
@@ -79,21 +73,17 @@ class FlightControllerEnd:
         self._tracker = shared.tracker
         self._notifier = notifier = StatusNotifier(shared.report, {"inject": None, "loop": None})
         self._commander = commander = Commander(config.companion_component)
-        self.requests = VehicleRequests(config, commander)
+        self._streams = StreamKeeper(config, commander)
+        self.mission = MissionWatch(config.companion_component)
         self.time_sync = TimeSync(
             shared.tracker, config.companion_component, notifier, shared.clock
         )
         self.origin = OriginExchange(config, shared.tracker, commander, notifier, self.counters)
         self.outcome = InjectionOutcome(shared, self.origin, notifier, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, notifier, self.counters)
-        self.sources = SourceOrders(config.switch, commander, notifier, self.counters)
-        self._no_go = _no_go_memory(config)
-        self._interlock = ShadowInterlock(
-            config.injection.force,
-            self.shadow_score,
-            lambda: self.outcome.compared_ns,
-            notifier,
-            self._no_go,
+        self.sources = SourceSwitch(config.switch, commander, notifier, self.counters)
+        self.interlock = ShadowInterlock(
+            config, self.shadow_score, lambda: self.outcome.compared_ns, notifier
         )
         self.news = VehicleEvents(notifier)
         self._warnings = FixWarnings(shared, self.sender.injector, notifier)
@@ -120,29 +110,16 @@ class FlightControllerEnd:
             return False
         return None if current is None else self.sources.on_gnss
 
-    def set_map_id(self, map_id: str) -> None:
-        """Set the id of the map; called before `recall`."""
-        if self._no_go is not None:
-            self._no_go.about = map_id
-
-    def recall(self) -> None:
-        """Restore and report a killed process's failed shadow check; before the link starts."""
-        self._interlock.recall()
-
-    def end(self, *, clean_shutdown: bool = True) -> None:
-        """Delete the stored shadow failure (clean_shutdown) or keep it; the first call counts."""
-        self._interlock.end(clean_shutdown=clean_shutdown)
-
     def inhibit(self, of: AlertId) -> None:
         """Prevent what the alert inhibits from starting, until `clear`."""
         if Inhibits.INJECTION in CATALOGUE[of].inhibits:
-            self._interlock.inhibited_by |= {of}
+            self.interlock.inhibited_by |= {of}
         if Inhibits.EKF_OK in CATALOGUE[of].inhibits:
             self.outcome.ekf_ok_inhibited_by |= {of}
 
     def clear(self, of: AlertId) -> None:
         """End the inhibition by this alert."""
-        self._interlock.inhibited_by -= {of}
+        self.interlock.inhibited_by -= {of}
         self.outcome.ekf_ok_inhibited_by -= {of}
 
     @property
@@ -168,7 +145,7 @@ class FlightControllerEnd:
         result: Figures = {}
         result.update({f"inject_{k}": v for k, v in dict(injector.counters).items()})
         result.update({f"bridge_{k}": v for k, v in dict(self.counters).items()})
-        result.update({f"rx_{k}": v for k, v in dict(self.requests.streams.counts).items()})
+        result.update({f"rx_{k}": v for k, v in dict(self._streams.counts).items()})
         result["inject_reason"] = "" if injector.reason is None else injector.reason.id.value
         result["reset_counter"] = injector.reset_counter
         yaw = injector.yaw_difference_rad
@@ -182,11 +159,6 @@ class FlightControllerEnd:
         result["fixes_not_taken"] = self.sender.dropped
         return result
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of entries in each queue, by name."""
-        parts = (self.sender, self.outcome, self.components, self.time_sync)
-        return {name: length for part in parts for name, length in part.queue_lengths().items()}
-
     # --- messages in ----------------------------------------------------------------------------
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
@@ -198,7 +170,7 @@ class FlightControllerEnd:
         if not self._tracker.accepts(message):
             self._strangers.on_message(link, message)
             return
-        self.requests.streams.on_message(kind, time_ns)
+        self._streams.on_message(kind, time_ns)
         if kind == "HEARTBEAT":
             link.keep_peer()
         if kind == "TIMESYNC":
@@ -207,7 +179,7 @@ class FlightControllerEnd:
         elif kind == "GPS_GLOBAL_ORIGIN":
             self.origin.on_message(message, time_ns)
         elif kind in MISSION_IN:
-            self.requests.mission.on_message(link, message, time_ns)
+            self.mission.on_message(link, message, time_ns)
         elif kind == "COMMAND_ACK":
             self._acknowledged(link, message, time_ns)
         elif self._tracker.handle(message, time_ns):
@@ -236,15 +208,20 @@ class FlightControllerEnd:
         self.origin.forget()
         self.sender.rebooted()
         self.sources.rebooted()
-        self.requests.reset()
+        self._request_all()
         self._notifier.report(alert(AlertId.FC_REBOOTED))
+
+    def _request_all(self) -> None:
+        """Request everything again, because the link was opened or the vehicle is back."""
+        self._streams.reset()
+        self.mission.reset()
 
     # --- the clockwork --------------------------------------------------------------------------
 
     def on_open(self, link: Link) -> None:
         """Announce our components at once, and request everything again."""
         self.components.announce()
-        self.requests.reset()
+        self._request_all()
         self.time_sync.reset()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
@@ -261,7 +238,8 @@ class FlightControllerEnd:
         if link.system_id:
             self.components.heartbeat(link, now_ns)
         if state.connected:
-            self.requests.tick(link, state, now_ns)
+            self.mission.tick(link, state, now_ns)
+            self._streams.tick(link, state, now_ns)
             self.time_sync.tick(link, now_ns)
             self.origin.tick(link, now_ns, may_set=self.injecting)
             look = self._shared.look.due(now_ns)
@@ -277,7 +255,7 @@ class FlightControllerEnd:
             return
         self._connected = state.connected
         if state.connected:
-            self.requests.reset()
+            self._request_all()
             self.sources.on_first_message(state)
         else:
             self.counters["lost"] += 1
@@ -288,7 +266,7 @@ class FlightControllerEnd:
         sender = self.sender
         sender.drain_queue(now_ns)
         shared = self._shared
-        mode = self._mode = self._interlock.mode(
+        mode = self._mode = self.interlock.mode(
             shared.mode(), state, now_ns, by_pilot=shared.enable is not None
         )
         if mode == "off" or not state.connected:
@@ -313,7 +291,7 @@ class FlightControllerEnd:
         if self.outcome.check_ekf(state, now_ns):
             sender.injector.announce_jump()
         came = sender.is_good(now_ns)
-        may_switch = self._interlock.may_switch(now_ns)
+        may_switch = self.interlock.may_switch(now_ns)
         good = came and self.injecting
         may_inject = self._shared.mode() == "inject"
         # A set that is not known is ordered, so that it is; shadow mode orders nothing.
@@ -322,5 +300,5 @@ class FlightControllerEnd:
                 link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
             )
         held = came and may_inject
-        self.news.set_hold_reason(self._interlock.reason if held else None, now_ns)
+        self.news.set_hold_reason(self.interlock.reason if held else None, now_ns)
         self.news.update(state, now_ns, injecting=good, refused=self.sources.gnss_refused)

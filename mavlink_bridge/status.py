@@ -52,16 +52,14 @@ class OperatorStatus:
         """The localizer's health level for the heartbeats."""
         return self._level
 
-    def set_health(
-        self, level: HealthLevel, alerts: Sequence[Alert], *, tell: bool, now_ns: int | None = None
-    ) -> None:
+    def set_health(self, level: HealthLevel, alerts: Sequence[Alert], *, tell: bool) -> None:
         """Set the health and all active alerts, most severe first; call it repeatedly. New alerts
         are reported (`report`) if `tell`, otherwise noted as reported.
 
         An alert that comes and goes is sent at most every 10 s. Its end is sent only after it has
-        lasted, because an overload may begin and end every other second. now_ns: CLOCK_MONOTONIC.
+        lasted, because an overload may begin and end every other second.
         """
-        now_ns = self._clock() if now_ns is None else now_ns
+        now_ns = self._clock()
         keys = tuple(alert.key for alert in alerts)
         bad = level in (HealthLevel.DEGRADED, HealthLevel.FAILED)
         with self._health_lock:
@@ -81,17 +79,17 @@ class OperatorStatus:
             self._reported_ns |= dict.fromkeys(sent, now_ns)
         if tell:
             for alert in due:
-                self.report(alert, now_ns)
+                self.report(alert)
 
     def _is_due(self, alert: Alert, now_ns: int, *, bad: bool) -> bool:
         return not bad or now_ns - self._reported_ns.get(alert.key, -_AGAIN_NS) >= _AGAIN_NS
 
-    def report(self, alert: Alert, now_ns: int | None = None) -> None:
+    def report(self, alert: Alert) -> None:
         """Send an alert as STATUSTEXT, log it and pass it on. It is left out if it equals the last
         alert, with its values, and follows within a second: so many refused commands do not hide
-        other alerts. now_ns: None for the own clock.
+        other alerts.
         """
-        if self._is_repeated(alert, self._clock() if now_ns is None else now_ns):
+        if self._is_repeated(alert, self._clock()):
             return
         self._alerts.append(alert)
         grave = severity(alert) <= mavlink.MAV_SEVERITY_WARNING

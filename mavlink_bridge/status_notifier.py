@@ -93,7 +93,9 @@ class StatusNotifier:
         """As `notify`, for problems that come and go: reports each problem once, then the relief
         after a time without problems (`wait_s` at first, see `Hysteresis`).
         """
-        settling = self._settling.setdefault(topic, Hysteresis(wait_s))
+        settling = self._settling.get(topic)
+        if settling is None:
+            settling = self._settling[topic] = Hysteresis(wait_s)
         over = settling.is_over(now_ns, bad=problem is not None)
         told = self._since_relief.setdefault(topic, set())
         if problem is not None and problem.key not in told:

@@ -39,8 +39,7 @@ from sitl.demo.scenario import (
     named_scenario,
     scenario_names,
 )
-from sitl.demo.script import FlightError
-from sitl.errors import SimulationError
+from sitl.errors import FlightError, SimulationError
 from sitl.operator.follow_run import fly_follows
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
@@ -100,10 +99,7 @@ def demo(
     ] = None,
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
-    script = named_scenario(scenario) if scenario else Scenario()
-    script = script.ideal() if ideal else script
-    if injection is not None:
-        script = Scenario.model_validate(script.model_dump() | {"injection": injection})
+    script = _script(scenario, ideal, injection=injection)
     console = Console()
     if map_ is not None:
         rehearsal = rehearse(map_, live, mission, script)
@@ -140,10 +136,7 @@ def sequence(
     ideal: Annotated[bool, typer.Option("--ideal", help=_IDEAL)] = False,
 ) -> None:
     """Record the scenario's path, flown without dynamics, as a sequence for `companion eval`."""
-    script = named_scenario(scenario) if scenario else Scenario()
-    script = script.ideal() if ideal else script
-    if condition is not None:
-        script = Scenario.model_validate(script.model_dump() | {"condition": condition})
+    script = _script(scenario, ideal, condition=condition)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ScenarioError(f"{out}: exists already and is not empty; give another folder")
     console = Console()
@@ -253,6 +246,14 @@ def _tell_endpoint(console: Console, endpoint: str) -> None:
     """An own line, which stays above the bar."""
     _, host, port = endpoint.split(":")
     console.print(f"ground station: [green]TCP {host} port {port}[/] (QGroundControl: Comm Links)")
+
+
+def _script(name: str | None, ideal: bool, **options: str | None) -> Scenario:
+    """The scenario of a command with the options that were given."""
+    script = named_scenario(name) if name else Scenario()
+    script = script.ideal() if ideal else script
+    given = {key: value for key, value in options.items() if value is not None}
+    return Scenario.model_validate(script.model_dump() | given) if given else script
 
 
 def _world_of(

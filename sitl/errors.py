@@ -11,5 +11,9 @@ class WorldCameraError(SimulationError):
     """A world camera that could not start, or whose process died."""
 
 
+class FlightError(SimulationError):
+    """A flight that was aborted; names the part that failed and its log."""
+
+
 class PilotError(SimulationError):
     """The vehicle refused, or did not do in time, what the pilot asked."""

@@ -20,6 +20,7 @@ import pytest
 
 os.environ["NUMBA_NRT_STATS"] = "1"  # before numba is imported: a test counts allocations
 
+from localizer.map.building.build import build_cache
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
@@ -62,15 +63,15 @@ def real_data() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What tests of every process and part share: who writes in it holds `_alone_in`."""
+    """What tests of every process and part share: who writes to it holds `_alone_at`."""
     given = os.environ.get(SHARED_FOLDER)
     return Path(given) if given else tmp_path_factory.mktemp("shared")
 
 
 @contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Other processes that ask for the folder wait."""
-    with (folder / "lock").open("w") as lock:
+def _alone_at(path: Path) -> Iterator[None]:
+    """Other processes that ask for the same wait."""
+    with path.with_name(f"{path.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
@@ -78,8 +79,19 @@ def _alone_in(folder: Path) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def small_assets(shared_folder: Path) -> FlightAssets:
     """A 400 m world with both caches: 12 s of processor, so all tests share it."""
-    with _alone_in(shared_folder):
-        return prepare(5, shared_folder / "worlds", size_m=400.0, ideal=True)
+    worlds = shared_folder / "worlds"
+    with _alone_at(worlds):
+        return prepare(5, worlds, size_m=400.0, ideal=True)
+
+
+@pytest.fixture(scope="session")
+def quito_map(real_data: Callable[[str], Path], shared_folder: Path) -> Path:
+    """The real mesh "quito" as a tile cache: half a minute of processor, so all tests share it."""
+    source, cache = real_data("quito") / "tileset.json", shared_folder / "quito"
+    with _alone_at(cache):
+        if not cache.exists():
+            build_cache(source, cache)
+    return cache
 
 
 @pytest.fixture(scope="session")
@@ -90,7 +102,7 @@ def small_sequence(small_assets: FlightAssets, shared_folder: Path) -> Path:
         takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
     ).ideal()
     out, done = shared_folder / "sequence", shared_folder / "sequence-complete"
-    with _alone_in(shared_folder):
+    with _alone_at(out):
         if not done.exists():
             shutil.rmtree(out, ignore_errors=True)
             assert record_scenario(small_assets, scenario, 5, out) >= 25
@@ -131,7 +143,8 @@ def watched_processors() -> Callable[[], AbstractContextManager[Processors]]:
 @dataclass(frozen=True)
 class Reading:
     """Seconds since some start: of the wall's clock, of processors that idled, of processors that
-    worked, and of those that worked for this process and its children.
+    worked, and of those that worked for this process and its children. What runs at a lower
+    priority gives way, and counts as idle.
     """
 
     wall_s: float
@@ -200,8 +213,8 @@ def read_processors() -> Reading:
     while parents:
         own_s += sum(used_s[pid][1] for pid in parents)
         parents = {pid for pid, (parent, _) in used_s.items() if parent in parents}
-    busy_s = user + nice + system + sum(rest)
-    return Reading(time.monotonic(), idle + waiting, busy_s, own_s)
+    busy_s = user + system + sum(rest)
+    return Reading(time.monotonic(), idle + waiting + nice, busy_s, own_s)
 
 
 def _skip_if_starved(when: str) -> None:
@@ -244,7 +257,13 @@ def _wanted(path: Path, config: pytest.Config) -> bool:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the part asked for; skip what needs a missing part, with the reason."""
+    """Keep the part asked for; skip what needs a missing part, with the reason.
+
+    Files with tests of real data, which take longest, come first: no worker ends with one of them
+    while the other has nothing left to do.
+    """
+    long = {item.path for item in items if item.get_closest_marker("real")}
+    items.sort(key=lambda item: item.path not in long)
     others = [item for item in items if not _wanted(item.path, config)]
     config.hook.pytest_deselected(items=others)
     items[:] = [item for item in items if item not in set(others)]

@@ -1,13 +1,10 @@
 """The suite in three parts: `python -m tests.parts [pytest's arguments]`, as `make test` calls it.
 
-Most tests run first, two at a time; then, likewise, those that fly a simulated vehicle without
-pictures: each is content with a core that nobody else uses. What streams pictures in real time or
-drives a browser runs after them, one at a time, with the machine to itself. Each part prints its
-own summary with its slowest tests; a failure of one does not keep the next from running. `pytest`
-alone runs all as one.
-
-mypy runs beside the first part, in what its waiting tests leave of the processors, and is told
-after it: most of a minute for which no test waits.
+Most tests run first, two at a time. Beside them run those that fly a simulated vehicle without
+pictures, which mostly wait, and mypy: the vehicles get a processor as soon as they want one, mypy
+what is left. What streams pictures in real time or drives a browser runs after them, one at a time,
+with the machine to itself. Each part prints its own summary with its slowest tests; a failure of
+one does not keep the next from running. `pytest` alone runs all as one.
 """
 
 from __future__ import annotations
@@ -16,7 +13,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 SIDE_BY_SIDE, VEHICLES, ALONE = "side-by-side", "vehicles", "alone"
@@ -26,7 +24,6 @@ PARTS = (SIDE_BY_SIDE, VEHICLES, ALONE)
 FLIES = (
     "tests/companion/preflight/test_coverage.py",
     "tests/examples/test_bridge_examples.py",
-    "tests/mavlink_bridge/link/test_mavproxy.py",
     "tests/mavlink_bridge/link/test_routing.py",
     "tests/mavlink_bridge/preflight/test_mission.py",
     "tests/mavlink_bridge/test_look_at.py",
@@ -49,9 +46,12 @@ RUNS_ALONE = (
 # Where the parts find what is dear to build (tests/conftest.py); a folder that lives as long.
 SHARED_FOLDER = "PILOT_TEST_SHARED"
 
-# A file's tests share its fixtures, so one worker runs them; a core for each of two workers. A
-# worker that a test crashes is not replaced, because xdist would run that test again, for ever.
-WORKERS = ("--numprocesses=2", "--dist=loadfile", "--max-worker-restart=0")
+# A file's tests share its fixtures, so one worker runs them; a core for each of two workers. Files
+# are run in the order of tests/conftest.py. A worker that a test crashes is not replaced, because
+# xdist would run that test again, for ever.
+WORKERS = (
+    "--numprocesses=2", "--dist=loadfile", "--no-loadscope-reorder", "--max-worker-restart=0",
+)  # fmt: skip
 
 # A test that hangs ends its process, and every thread's stack is printed.
 PATIENCE_S = 900
@@ -60,7 +60,8 @@ HANGS_END = tuple(f"--override-ini={setting}" for setting in _PATIENT)
 
 _ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-# Behind everything else: the tests get a processor as soon as they want one.
+# Who waits for whom while the first part runs: vehicles come before its tests, and mypy last.
+_PRIORITIES = {SIDE_BY_SIDE: 15, VEHICLES: 0, ALONE: 0}
 _MYPY = ("nice", "-n", "19", sys.executable, "-m", "mypy")
 
 _PASSED, _NOTHING_RAN = 0, 5  # pytest's exit codes
@@ -86,34 +87,42 @@ def together(codes: Sequence[int]) -> int:
 
 def main(arguments: Sequence[str]) -> int:
     """Run all parts with pytest's arguments; pytest's exit code, or mypy's if that alone failed."""
-    with tempfile.TemporaryDirectory(prefix="tests-") as shared, _beside(_MYPY) as types:
+    with tempfile.TemporaryDirectory(prefix="tests-") as shared:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
-        codes = {SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*WORKERS, *arguments], common | _ONE_CORE)}
-        types_code = _told(types)  # before what needs its processors for itself
-        codes |= {
-            VEHICLES: _run(VEHICLES, [*WORKERS, *arguments], common | _ONE_CORE),
-            ALONE: _run(ALONE, arguments, common),
-        }
+        crowded = common | _ONE_CORE
+        with (
+            _beside(_MYPY, common) as types,
+            _beside(_pytest(VEHICLES, [*WORKERS, *arguments]), crowded) as vehicles,
+        ):
+            first = _pytest(SIDE_BY_SIDE, [*WORKERS, *arguments])
+            codes = {SIDE_BY_SIDE: subprocess.run(first, env=crowded, check=False).returncode}
+        codes[VEHICLES] = vehicles.returncode
+        last = subprocess.run(_pytest(ALONE, arguments), env=common, check=False)
+        codes[ALONE] = last.returncode
     outcome = ", ".join(f"{part} part: {_word(code)}" for part, code in codes.items())
-    print(f"types: {_word(types_code)}, {outcome}", flush=True)
-    return together(list(codes.values())) or types_code
+    print(f"types: {_word(types.returncode)}, {outcome}", flush=True)
+    return together(list(codes.values())) or types.returncode
 
 
-def _run(part: str, arguments: Sequence[str], environment: Mapping[str, str]) -> int:
+def _pytest(part: str, arguments: Sequence[str]) -> list[str]:
     options = (f"--part={part}", "--durations=25", *HANGS_END)
-    command = [sys.executable, "-m", "pytest", *options, *arguments]
-    return subprocess.run(command, env=environment, check=False).returncode
+    priority = ("nice", "-n", str(_PRIORITIES[part]))
+    return [*priority, sys.executable, "-m", "pytest", *options, *arguments]
 
 
-def _beside(command: Sequence[str]) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-
-
-def _told(process: subprocess.Popen[bytes]) -> int:
-    """Wait for its end and print what it said; its exit code."""
-    said, _ = process.communicate()
-    print(said.decode(errors="replace"), end="", flush=True)
-    return process.returncode
+@contextmanager
+def _beside(
+    command: Sequence[str], environment: Mapping[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command meanwhile; at the end it is waited for, and what it said is printed."""
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(command, env=environment, stdout=said, stderr=subprocess.STDOUT)
+        try:
+            yield process
+        finally:
+            process.wait()
+            said.seek(0)
+            print(said.read().decode(errors="replace"), end="", flush=True)
 
 
 def _word(code: int) -> str:

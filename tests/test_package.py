@@ -60,7 +60,8 @@ def environment(built):
     site = next(folder.glob("lib/python*/site-packages"))
     (wheel,) = built.glob("*.whl")
     _run(
-        sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel,
+        sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-compile",
+        "--target", site, wheel,
     )  # fmt: skip
     (site / "borrowed.pth").write_text(f"{SITE}\n")
     return folder / "bin" / "python"

@@ -18,10 +18,11 @@ import json
 from pathlib import Path
 
 from benchmarks.calibration.report import COLUMNS, rows_of, summary
-from benchmarks.calibration.run import TRUTH, read, record_draw, solve_draw
+from benchmarks.calibration.run import TRUTH, record_draw, solve_draw
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
+from benchmarks.common.lines import read_lines
 from benchmarks.common.named_errors import named_errors
 from sitl.demo.assets import prepare
 
@@ -45,7 +46,7 @@ def main() -> None:
     args = parser().parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     path = args.folder / "draws.jsonl"
-    rows = read(path)
+    rows = read_lines(path) if path.exists() else []
     if not args.report:
         more_time = deadline(args.minutes)
         assets = prepare(args.world)
@@ -62,7 +63,7 @@ def main() -> None:
                 with path.open("a") as file:
                     file.write(json.dumps(row) + "\n")
             print(f"draw {seed}: done, {len(left)} left", flush=True)
-        rows = read(path)
+        rows = read_lines(path) if path.exists() else []
     if rows:
         made = summary(rows)
         print(f"{made['draws']} draws")

@@ -139,14 +139,3 @@ def _again(
         name: _errors(sortie.localized(config, seed + _AGAIN, keep=False))
         for name, config in deployments.items()
     }
-
-
-def read(path: Path) -> list[dict[str, Any]]:
-    """The draws of a file; a line that an interrupt cut short is left out."""
-    rows = []
-    for line in path.read_text().splitlines() if path.exists() else ():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return rows

@@ -1,4 +1,4 @@
-"""Features side by side, by condition: intensity, gradient, SIFT and XFeat with PnP, the network.
+"""Features side by side, by condition: gradient, SIFT and XFeat with PnP, the network.
 
     python -m benchmarks.features --pairs 200 --seed 0 --out seed0.csv
     python -m benchmarks.features --report seed0.csv seed1.csv quito.csv   (pooled, and each set)
@@ -31,7 +31,6 @@ from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.features.methods import (
     DirectMethod,
-    IntensityExtractor,
     Levelled,
     Method,
     load_xfeat,
@@ -81,7 +80,6 @@ def evaluate(
 
 
 BASELINES: dict[str, tuple[str, Callable[[int], Method]]] = {
-    "intensity": ("intensity", lambda n: DirectMethod(IntensityExtractor(), n)),
     "gradient": ("gradient", lambda n: DirectMethod(DetailExtractor(GradientExtractor()), n)),
     "sift": ("SIFT + PnP", lambda _: sift_pnp),
     "xfeat": ("XFeat + PnP", lambda _: load_xfeat()),

@@ -15,30 +15,13 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
 from localizer.tracking.pipeline import reference_anchors
-from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
+from localizer.types import Image, PosePrior, RenderedView
 
 Method = Callable[[RenderedView, Image, PosePrior, int], Pose]
 Pixels = NDArray[np.float64]
 
 _RATIO = 0.8  # Lowe's test
 _INLIER_PX = 3.0
-
-
-class IntensityExtractor:
-    """Locally normalised grey values at the same strides as the network."""
-
-    name = "intensity"
-
-    def extract(self, rgb: Image) -> FeaturePyramid:
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-        levels = []
-        for stride in (8, 4, 2):
-            smooth = cv2.GaussianBlur(gray, (0, 0), 0.6 * stride)
-            size = (gray.shape[1] // stride, gray.shape[0] // stride)
-            small = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA)
-            value = 0.5 * (small - small.mean()) / (small.std() + 1e-3)
-            levels.append(FeatureLevel(value[..., None], np.ones_like(value), stride))
-        return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
 
 class DirectMethod:

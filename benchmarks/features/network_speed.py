@@ -3,15 +3,17 @@
     python -m benchmarks.features.network_speed [--s0 MODEL.onnx] [--threads 2] [--json out.json]
 
 Without a model of `s0` an untrained one is exported (extra `train`): weights do not change its
-time. The features are copied back to the host, as in flight. Medians; the first calls, in which
-engines are built, are not counted.
+time. The features are copied back to the host, as in flight. Medians of time and of processor time
+on all threads. The providers take turns, and their first calls, in which engines are built, are not
+counted.
 """
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,11 +25,11 @@ from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
 from localizer.features.extractor import SHIPPED_MODEL, OnnxExtractor
 from localizer.features.providers import SHORT_NAMES, available_providers
-from localizer.types import Image
 
 ROOT = Path(__file__).resolve().parents[2]
-SIZES = ((320, 240), (512, 512))
-COLUMNS = ("network", "provider", "size", "time, ms")
+SIZES = ((320, 240), (640, 480))
+_WARM = 3  # calls that are not counted
+COLUMNS = ("network", "provider", "size", "time, ms", "processor, ms")
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class SpeedRow:
     provider: str
     size: tuple[int, int]
     time_ms: float
+    cpu_ms: float
 
 
 def untrained_s0(folder: Path) -> list[Path]:
@@ -65,40 +68,33 @@ def untrained_s0(folder: Path) -> list[Path]:
     return models
 
 
-def median_ms(call: Callable[[Image], object], image: Image, count: int) -> float:
-    """Median milliseconds of `count` calls after some that are not counted."""
-    times = []
-    for _ in range(count + 3):
-        began = time.perf_counter()
-        call(image)
-        times.append(time.perf_counter() - began)
-    return 1e3 * float(np.median(times[3:]))
-
-
 def measure(
     models: Sequence[Path], sizes: Sequence[tuple[int, int]], threads: int, count: int
 ) -> Iterator[SpeedRow]:
     """Every model at every size on every installed provider that runs it."""
     installed = [SHORT_NAMES[n] for n in available_providers() if n in SHORT_NAMES]
-    for model in models:
+    for model, size in itertools.product(models, sizes):
+        runs: dict[OnnxExtractor, list[tuple[float, float]]] = {}
         for provider in installed:
-            for size in sizes:
-                image = np.random.default_rng(0).integers(
-                    0, 256, (size[1], size[0], 3), dtype=np.uint8
-                )
-                try:
-                    extractor = OnnxExtractor(model, threads=threads, size=size, only=provider)
-                except ModelError as error:
-                    print(f"left out: {error}")
-                    continue
-                time_ms = median_ms(extractor.extract, image, count)
-                yield SpeedRow(extractor.info.name, provider, size, time_ms)
+            try:
+                runs[OnnxExtractor(model, threads=threads, size=size, only=provider)] = []
+            except ModelError as error:
+                print(f"left out: {error}")
+        image = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+        for _ in range(count + _WARM):
+            for extractor, times in runs.items():
+                began, cpu = time.perf_counter(), time.process_time()
+                extractor.extract(image)
+                times.append((time.perf_counter() - began, time.process_time() - cpu))
+        for extractor, times in runs.items():
+            time_ms, cpu_ms = 1e3 * np.median(times[_WARM:], axis=0)
+            yield SpeedRow(extractor.info.name, extractor.provider, size, time_ms, cpu_ms)
 
 
 def cells(row: SpeedRow) -> tuple[str, ...]:
     """As `COLUMNS` names them."""
     size = f"{row.size[0]} x {row.size[1]}"
-    return row.model, row.provider, size, f"{row.time_ms:.2f}"
+    return row.model, row.provider, size, f"{row.time_ms:.2f}", f"{row.cpu_ms:.2f}"
 
 
 def main() -> None:

@@ -15,7 +15,8 @@ import numpy as np
 from localizer.geometry.pose import Pose
 from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
-from localizer.training.data.shards import PhotoSource, read_shard, shard_path, write_shards
+from localizer.training.data.shards import read_shard, shard_path, write_shards
+from localizer.training.places.photos import PhotoLibrary
 from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose
@@ -77,7 +78,7 @@ def made_pairs(count: int, which: MadePlaces, cache: Path, workers: int = 2) -> 
     folder = cache / which.name
     photos = None
     if which.textures is not None:
-        photos = PhotoSource(which.textures, UNSEEN_GROUPS, held_out=True)
+        photos = PhotoLibrary(which.textures, UNSEEN_GROUPS, held_out=True)
     for _ in write_shards(folder, places, which.scenes, photos, workers):
         pass
     pairs: list[TestPair] = []

@@ -31,7 +31,7 @@ from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.integrity.fit import fit, fit_table
 from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
-from benchmarks.integrity.report import COLUMNS, by_condition, cells, rows
+from benchmarks.integrity.report import COLUMNS, cells, rows
 from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
@@ -81,11 +81,8 @@ def main() -> None:
         args.fit.write_text(json.dumps(fitted, indent=2) + "\n")
         print(fit_table(fitted))
         return
-    config = IntegrityConfig()
-    made = rows(outcomes, config)
+    made = rows(outcomes, IntegrityConfig())
     show_figures(args.json, COLUMNS, cells(made), {"rows": [asdict(r) for r in made]})
-    print()
-    print(by_condition(outcomes, config))
 
 
 if __name__ == "__main__":

@@ -46,9 +46,6 @@ def acceptances(config: IntegrityConfig) -> dict[str, Acceptance]:
 
     return {
         WITHOUT: plain,
-        "second mode 5 % worse": lambda o: plain(o) and o.lead >= 0.05,
-        "quality 0.3": lambda o: plain(o) and o.quality >= 0.3,
-        "peak 4.5": lambda o: plain(o) and o.peak >= 4.5,
         LIKELY: likely,
         DISTINCT: by_prior,
         FOCAL: lambda o: likely(o) and focal(o),
@@ -120,21 +117,3 @@ def cells(made: Sequence[AcceptanceRow]) -> list[tuple[str, ...]]:
         for r in made
         if r.set in _TOGETHER or r.acceptance == OURS
     ]
-
-
-def by_condition(outcomes: Sequence[StartOutcome], config: IntegrityConfig) -> str:
-    """Right results lost by our tests, of each condition, and of a focal length that is 5 % off."""
-    tests = acceptances(config)
-    lines = ["| right results | lost by our tests, % |", "|---|---|"]
-    for condition in sorted({o.condition for o in outcomes}):
-        mine = [o for o in outcomes if o.condition == condition and o.right and tests[WITHOUT](o)]
-        lost = sum(not tests[OURS](o) for o in mine)
-        lines.append(f"| {condition} | {Rate.of(lost, len(mine))} |")
-    focal = [o for o in outcomes if o.kind == "focal near"]
-    for label in (WITHOUT, LIKELY, OURS):
-        false = sum(tests[label](o) and not o.right for o in focal)
-        lines.append(
-            f"| focal length 5 % off, begun right: accepted > 3 m off, {label} "
-            f"| {Rate.of(false, len(focal))} |"
-        )
-    return "\n".join(lines)

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.common.arguments import Parser, output
 from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
-from benchmarks.optimizer.problem import SIZES, make_problem, make_swarm, naive_torch
+from benchmarks.optimizer.problem import SIZES, make_problem, make_swarm
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.registration.backend import (
@@ -81,28 +81,6 @@ def fused_ms(backend: CudaBackend, problem: LevelProblem, swarm: Poses) -> float
     return (found[1] - found[0]) / 6
 
 
-def torch_ms(problem: LevelProblem, swarm: Poses) -> float | None:
-    """The naive batched PyTorch on the same GPU; None without a PyTorch that sees it."""
-    try:
-        import torch
-    except ImportError:
-        return None
-    if not torch.cuda.is_available():
-        return None
-
-    step = naive_torch(problem, swarm)
-    times = []
-    for k in range(WARM_UP + REPEATS):
-        start, stop = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        step()
-        stop.record()
-        torch.cuda.synchronize()
-        if k >= WARM_UP:
-            times.append(start.elapsed_time(stop))
-    return float(np.median(times))
-
-
 def pyramid_problem(
     swarm: Poses, channels: int, anchors: int = 500
 ) -> tuple[FeaturePyramid, Camera, Anchors, np.ndarray]:
@@ -155,12 +133,9 @@ def measured(device: Device) -> list[tuple[str, ...]]:
     problems, swarm = {size: make_problem(size) for size in SIZES}, make_swarm()
     backend = CudaBackend(device)
     print(f"{backend.kernels(32).resources('refine_many')}")
-    naive = [torch_ms(problem, swarm) for problem in problems.values()]
-    fused = [fused_ms(backend, problem, swarm) for problem in problems.values()]
     rows: list[tuple[str, ...]] = [
-        (f"LM iteration, {name}", f"{size} x {size}", "-" if ms is None else f"{ms:.4f}")
-        for name, values in (("naive PyTorch", naive), ("fused kernel", fused))
-        for size, ms in zip(SIZES, values, strict=True)
+        ("LM iteration", f"{size} x {size}", f"{fused_ms(backend, problem, swarm):.4f}")
+        for size, problem in problems.items()
     ]
     for label, config, anchors in SCHEDULES:
         upload, graph, error = schedule_ms(backend, swarm, config, anchors)

@@ -1,7 +1,7 @@
 """Six generated places in six conditions at two heights: the paper's Table 2 with its rivals.
 
     python -m benchmarks.places run FOLDER [--frames 30] [--processes 2] [--minutes 5]
-    python -m benchmarks.places table FOLDER [--frames 30] [--out six-places.md] [--plot six.png]
+    python -m benchmarks.places table FOLDER [--frames 30] [--json DIR] [--plot six.png]
 
 Each place is surveyed once and seen at other visits (what was built, felled and grown since,
 another fine texture, a survey's own errors), through a rolling shutter, with a calibration and time
@@ -21,11 +21,10 @@ from pathlib import Path
 
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS
+from benchmarks.places.flights import FULL, cells
 from benchmarks.places.rivals import RIVALS, unavailable
-from benchmarks.places.run import PlacesPlan, chosen_cells, run
+from benchmarks.places.run import PlacesPlan, run
 from benchmarks.places.table import draw, markdown, read_results, write_json
-from benchmarks.places.worlds import PLACES
 
 
 def main() -> None:
@@ -34,21 +33,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of worlds, sequences and results")
     parser.add_argument("--frames", type=whole(2, FULL), default=FULL, help="of each sequence")
     parser.add_argument("--width", type=whole(64, 2048), default=320, help="of every method, px")
-    parser.add_argument("--places", nargs="+", choices=[p.name for p in PLACES], help="these alone")
-    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, help="these alone")
-    parser.add_argument("--heights", nargs="+", choices=HEIGHTS, help="these alone")
     parser.add_argument("--methods", nargs="+", choices=list(RIVALS), help="these alone")
     parser.add_argument("--processes", type=whole(1, 256), default=2, help="one core each")
     parser.add_argument("--minutes", type=number(0.1, 1e5), default=1e5,
                         help="after which no new sequence is begun")  # fmt: skip
-    parser.add_argument("--out", type=output, help="Markdown of the table")
     parser.add_argument("--json", type=Path, help="folder of the tables' figures")
     parser.add_argument("--plot", type=output, help="PNG of the errors")
     args = parser.parse_args()
-    wanted = chosen_cells(args.places or (), args.conditions or (), args.heights or ())
-    plan = PlacesPlan(
-        args.folder, args.frames, args.width, tuple(args.methods or RIVALS), tuple(wanted)
-    )
+    methods = tuple(args.methods or RIVALS)
+    plan = PlacesPlan(args.folder, args.frames, args.width, methods, tuple(cells()))
     (_run if args.what == "run" else _table)(plan, args)
 
 
@@ -67,10 +60,7 @@ def _run(plan: PlacesPlan, args: argparse.Namespace) -> None:
 def _table(plan: PlacesPlan, args: argparse.Namespace) -> None:
     plan = replace(plan, methods=tuple(m for m in plan.methods if plan.has_any(m)))
     results = read_results(plan)
-    text = markdown(plan, results)
-    print(text)
-    if args.out:
-        args.out.write_text(text)
+    print(markdown(plan, results))
     if args.json:
         write_json(plan, results, args.json)
     if args.plot:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 
-from benchmarks.places.flights import Cell, cells, sequence_of, true_path
+from benchmarks.places.flights import Cell, sequence_of, true_path
 from benchmarks.places.rivals import PASSES, RIVALS, Setting
 from benchmarks.places.turns import ToldTurns
 from benchmarks.places.worlds import open_place
@@ -46,19 +46,6 @@ class PlacesPlan:
     def missing(self, cell: Cell) -> tuple[str, ...]:
         """The methods that have not run on a sequence."""
         return tuple(m for m in self.methods if not self.result(cell, m).exists())
-
-
-def chosen_cells(
-    places: Sequence[str], conditions: Sequence[str], heights: Sequence[str]
-) -> list[Cell]:
-    """The cells of the table that are asked for; nothing named stands for all."""
-    return [
-        c
-        for c in cells()
-        if (not places or c.place.name in places)
-        and (not conditions or c.condition in conditions)
-        and (not heights or c.height in heights)
-    ]
 
 
 def run(plan: PlacesPlan, processes: int, minutes: float) -> Iterator[str]:

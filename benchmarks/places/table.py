@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.common.figures import markdown as table
 from benchmarks.common.figures import write_figures
 from benchmarks.places.flights import CONDITIONS, HEIGHT_M, HEIGHTS
 from benchmarks.places.rivals import MISSING, OURS, RIVALS
@@ -126,10 +127,7 @@ def _blocks(results: Sequence[Result]) -> list[Array]:
 def write_json(plan: PlacesPlan, results: Sequence[Result], folder: Path) -> None:
     """The tables that the documentation keeps: the whole one, and medians and R@3 by group."""
     folder.mkdir(parents=True, exist_ok=True)
-    mine = {m: [r for r in results if r.method == m] for m in plan.methods}
-    lines = [[c.strip() for c in _line(m, mine[m]).strip("| ").split("|")] for m in plan.methods]
-    lines += [[f"*paper: {name}*", *rest, "-", f"({fps})"] for name, *rest, fps in PAPER]
-    write_figures(folder / "six-places.json", _COLUMNS, lines)
+    write_figures(folder / "six-places.json", _COLUMNS, _rows(plan, results))
     names = ["", *(RIVALS[m].name for m in plan.methods)]
     for file, value, digits in (("median", median_m, 2), ("recall", recall_3, 0)):
         by_group = [
@@ -138,6 +136,12 @@ def write_json(plan: PlacesPlan, results: Sequence[Result], folder: Path) -> Non
             for group, members in groups(results).items()
         ]  # fmt: skip
         write_figures(folder / f"six-places-{file}.json", names, by_group)
+
+
+def _rows(plan: PlacesPlan, results: Sequence[Result]) -> list[tuple[str, ...]]:
+    """Under `_COLUMNS`: the plan's methods, then the paper's."""
+    ours = [_row(m, [r for r in results if r.method == m]) for m in plan.methods]
+    return ours + [(f"*paper: {name}*", *rest, "-", f"({fps})") for name, *rest, fps in PAPER]
 
 
 def _measured(mine: Sequence[Result], value: Callable[[Array], float | None], digits: int) -> str:
@@ -156,34 +160,37 @@ def groups(results: Sequence[Result]) -> dict[str, list[Result]]:
 def markdown(plan: PlacesPlan, results: Sequence[Result]) -> str:
     """What was run, the whole table, then median and R@3 by condition, place and height."""
     if not results:
-        return "No sequence has been done by all methods yet.\n"
+        return "No sequence has been done by all methods yet."
     count = len(results) // len(plan.methods)
     frames = sum(len(r.metres) for r in results) // len(plan.methods)
-    lines = [
-        f"{count} of {len(plan.cells)} sequences (six places, {len(CONDITIONS)} conditions, low: "
-        f"{HEIGHT_M['low']:.0f} m, high: {HEIGHT_M['high']:.0f} m), {plan.frames} consecutive"
-        f" frames each at 10 a second ({frames} in all), working width {plan.width}; the first "
-        f"frame's prior up to {PRIOR.translation_m:.0f} m and {PRIOR.rotation_deg:.0f} degrees off,"
-        " no other is given. 95 % intervals over places.",
-        "",
-        f"| {' | '.join(_COLUMNS)} |",
-        "|---" * len(_COLUMNS) + "|",
-    ]
-    for method in plan.methods:
-        lines.append(_line(method, [r for r in results if r.method == method]))
-    lines += [f"| *paper: {n}* | {m} | {d} | {r} | {c} | - | ({f}) |" for n, m, d, r, c, f in PAPER]
-    names = [RIVALS[m].name for m in plan.methods]
-    lines += ["", "Median in metres (R@3 in per cent) by group:", ""]
-    lines += ["| | sequences | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|"]
-    for group, members in groups(results).items():
-        cells = [_short([r for r in members if r.method == m]) for m in plan.methods]
-        lines.append(f"| {group} | {len(members) // len(plan.methods)} | {' | '.join(cells)} |")
-    lines += ["", "| method | settings |", "|---|---|"]
-    lines += [f"| {RIVALS[m].name} | {RIVALS[m].settings} |" for m in plan.methods]
-    return "\n".join([*lines, "", f"Not run: {MISSING}.", ""])
+    cells = [
+        (group, str(len(members) // len(plan.methods)),
+         *(_short([r for r in members if r.method == m]) for m in plan.methods))
+        for group, members in groups(results).items()
+    ]  # fmt: skip
+    settings = [(RIVALS[m].name, RIVALS[m].settings) for m in plan.methods]
+    return "\n".join(
+        [
+            f"{count} of {len(plan.cells)} sequences (six places, {len(CONDITIONS)} conditions, "
+            f"low: {HEIGHT_M['low']:.0f} m, high: {HEIGHT_M['high']:.0f} m), {plan.frames} "
+            f"consecutive frames each at 10 a second ({frames} in all), working width "
+            f"{plan.width}; the first frame's prior up to {PRIOR.translation_m:.0f} m and "
+            f"{PRIOR.rotation_deg:.0f} degrees off, no other is given. 95 % intervals over places.",
+            "",
+            table(_COLUMNS, _rows(plan, results)),
+            "",
+            "Median in metres (R@3 in per cent) by group:",
+            "",
+            table(("", "sequences", *(name for name, _ in settings)), cells),
+            "",
+            table(("method", "settings"), settings),
+            "",
+            f"Not run: {MISSING}.",
+        ]
+    )
 
 
-def _line(method: str, mine: Sequence[Result]) -> str:
+def _row(method: str, mine: Sequence[Result]) -> tuple[str, ...]:
     m = measures(mine)
     median = _with_interval(m.median_translation_m, interval(mine, median_m), 2)
     recall = f"{m.recall_1:.1f} / {m.recall_3:.1f} / {m.recall_5:.1f}"
@@ -191,9 +198,9 @@ def _line(method: str, mine: Sequence[Result]) -> str:
     if between:
         recall += f" (R@3 {between[0]:.0f} to {between[1]:.0f})"
     return (
-        f"| {RIVALS[method].name} | {median} | {_number(m.median_rotation_deg, 2)} | {recall} | "
-        f"{m.completeness:.1f} | {_false(mine)} | {m.fps:.1f} |"
-    )
+        RIVALS[method].name, median, _number(m.median_rotation_deg, 2), recall,
+        f"{m.completeness:.1f}", _false(mine), f"{m.fps:.1f}",
+    )  # fmt: skip
 
 
 def _false(mine: Sequence[Result]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -149,12 +148,9 @@ def summary(
         "auc": interval(scored, area),
         "told_of_failed": f"{int((told & bad).sum())} of {int(bad.sum())}",
         "false_alarms": f"{int((told & ~bad).sum())} of {int((~bad).sum())}",
-        "brier": float(np.mean((risk - [np.mean([failed(p) for p in x.pictures]) for x in legs])
-                               ** 2)),
         "sigma_ratio_median": interval(scored, sigma_ratio),
         "sigma_ratio_rms": interval(scored, sigma_ratio_rms),
         "rank_correlation": interval(scored, rank_correlation),
-        "risk_table": _reliability(risk, legs),
     }  # fmt: skip
 
 
@@ -170,25 +166,6 @@ def rows_of(parts: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
         )
         for name, part in parts.items()
     ]  # fmt: skip
-
-
-def _reliability(risk: Array, legs: Sequence[FlownLeg]) -> list[dict[str, Any]]:
-    """Forecast risk against the share of pictures that failed, by bins of risk."""
-    shares = np.array([np.mean([failed(p) for p in leg.pictures]) for leg in legs])
-    edges = (0.0, 0.05, 0.2, 0.5, 0.8, 1.0001)
-    rows = []
-    for low, high in itertools.pairwise(edges):
-        inside = (risk >= low) & (risk < high)
-        if inside.any():
-            rows.append(
-                {
-                    "risk": f"{low:g} to {min(high, 1):g}",
-                    "legs": int(inside.sum()),
-                    "forecast": float(risk[inside].mean()),
-                    "failed": float(shares[inside].mean()),
-                }
-            )
-    return rows
 
 
 def fitted(legs: Sequence[FlownLeg]) -> dict[str, Any]:

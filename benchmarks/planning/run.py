@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common.lines import read_lines
 from benchmarks.planning.legs import FORECASTS, PICTURES, TestLeg, draw_legs
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
@@ -154,13 +155,9 @@ def run_world(assets: FlightAssets, count: int, path: Path, more_time: Callable[
 
 
 def read(path: Path) -> list[FlownLeg]:
-    """The legs of a file; a line that an interrupt cut short is left out."""
+    """The legs of a file."""
     flown = []
-    for line in path.read_text().splitlines():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
+    for row in read_lines(path):
         try:
             row["figures"] = tuple(Figures(**f) for f in row["figures"])
             row["pictures"] = tuple(RegisteredFrame(**p) for p in row["pictures"])

@@ -17,7 +17,7 @@ defaults were chosen on (0). A run goes on where its file ends.
 
 With --flights (folders of `python -m sitl loop` or `demo`) it counts how many positions lay inside
 the level that they had in flight: those that were injected, and those that were withheld or flown
-in shadow; and what the monitor said, by finding.
+in shadow.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Any
 
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, output, whole
-from benchmarks.common.figures import markdown, write_figures
+from benchmarks.common.figures import markdown, show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.protection import flights
 from benchmarks.protection.draws import LENSES
@@ -127,9 +127,7 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
             left_out[folder.name] = str(error)
             print(f"left out: {error}")
     found = flights.report(flown) | {"left_out": left_out}
-    print(flights.table(found))
-    if out is not None:
-        write_figures(out, flights.COLUMNS, flights.rows(found), found)
+    show_figures(out, flights.COLUMNS, flights.rows(found), found)
 
 
 def main() -> None:

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import csv
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common.figures import markdown
 from benchmarks.common.shares import exact_interval
-from mavlink_bridge.alerts.alert import OutputAction
-from mavlink_bridge.alerts.catalogue import CATALOGUE
-from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR
-from mavlink_bridge.alerts.reading import alert_of
 from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.scenario import ScenarioError
@@ -24,7 +18,6 @@ from sitl.suite.loop.case import LoopCase, load_loop_cases
 
 _SENT = ("VISION_POSITION_ESTIMATE", "ODOMETRY", "GPS_INPUT")
 _GAP_NS = 1_000_000_000  # between true poses, beyond which the truth is not known
-_MONITORED = frozenset(spec.id for spec in (*INTEGRITY, *MONITOR))
 
 
 @dataclass(frozen=True)
@@ -41,20 +34,11 @@ class Position:
 
 @dataclass(frozen=True)
 class FlownPositions:
-    """Those of one flight. normal: nothing was wrong in it. told: what the monitor found, by name
-    of the finding, and how often it was said.
-    """
+    """Those of one flight. normal: nothing was wrong in it."""
 
     name: str
     normal: bool
     positions: tuple[Position, ...]
-    told: dict[str, int] = field(default_factory=dict)
-
-    @property
-    def was_withheld(self) -> bool:
-        """Whether the monitor withheld positions."""
-        holding = (s for s in CATALOGUE.values() if s.action is not OutputAction.NONE)
-        return any(spec.id.value in self.told for spec in holding)
 
 
 @dataclass(frozen=True)
@@ -94,7 +78,7 @@ def read_flight(folder: Path) -> FlownPositions:
     sent = _sent(folder / "flight.tlog")
     found = [position for row in rows if (position := _position(row, truth, sent)) is not None]
     normal = case.is_normal if case is not None else True
-    return FlownPositions(folder.name, normal, tuple(found), _told(folder))
+    return FlownPositions(folder.name, normal, tuple(found))
 
 
 def report(flights: Sequence[FlownPositions]) -> dict[str, Any]:
@@ -111,18 +95,6 @@ def report(flights: Sequence[FlownPositions]) -> dict[str, Any]:
     }
     return {
         "shares": {name: asdict(one) for name, one in shares.items() if one is not None},
-        "guardian": {
-            name: {
-                "flights": len(some),
-                "with a finding": sum(bool(f.told) for f in some),
-                "withheld": sum(f.was_withheld for f in some),
-            }
-            for name, some in (
-                ("normal", [f for f in flights if f.normal]),
-                ("faults", [f for f in flights if not f.normal]),
-            )
-        },
-        "told": {f.name: f.told for f in flights},
         "flights": {
             f.name: {
                 what: None if (one := share([f], injected=injected)) is None else asdict(one)
@@ -171,16 +143,6 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
     ]
 
 
-def table(found: dict[str, Any]) -> str:
-    """For docs/explanation/integrity.md."""
-    lines = (
-        f"\nguardian, {name}: {g['with a finding']} of {g['flights']} with a finding, "
-        f"{g['withheld']} withheld"
-        for name, g in found["guardian"].items()
-    )
-    return "\n".join([markdown(COLUMNS, rows(found)), *lines])
-
-
 def _case(folder: Path) -> LoopCase | None:
     """The flight that VEHICLE-NAME-SEED names; None of another one, as of a demo."""
     _, _, rest = folder.name.partition("-")
@@ -200,14 +162,6 @@ def _truth(path: Path) -> np.ndarray:
         ]
     poses = {int(row[0]): row for row in rows}
     return np.array([poses[time_ns] for time_ns in sorted(poses)], dtype=np.float64)
-
-
-def _told(folder: Path) -> dict[str, int]:
-    """How often each finding of the monitor was said, by the companion's events."""
-    rows = [row for path in sorted(folder.glob("companion*/events.csv")) for row in _rows(path)]
-    read = (alert_of(row["text"]) for row in rows)
-    found = (one[0] for one in read if one is not None and one[1])
-    return dict(Counter(of.value for of in found if of in _MONITORED))
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -89,7 +89,7 @@ def _one(
     verified, wall = time.process_time(), time.perf_counter() - wall
     right, error, rank = False, None, -1
     if asked.on is None:
-        rank = _rank(candidates, view)
+        rank = rank_of(candidates, view.truth, view.height)
         if found is not None:
             metres, degrees = found.world_from_camera.distance_to(view.truth)
             right, error = metres <= RIGHT_M and degrees <= RIGHT_DEG, metres
@@ -102,12 +102,12 @@ def _one(
     )  # fmt: skip
 
 
-def _rank(candidates: Sequence[PlaceCandidate], view: BasinView) -> int:
+def rank_of(candidates: Sequence[PlaceCandidate], truth: Pose, height_m: float) -> int:
     """Of the first candidate that looks at the ground within `NEAR_M` of what the view shows; -1
     without. What lies ahead is found, and the camera follows with its heading's error.
     """
-    aim = _aim(view.truth, view.height)
-    aims = np.array([_aim(c.world_from_camera, view.height) for c in candidates]).reshape(-1, 2)
+    aim = _aim(truth, height_m)
+    aims = np.array([_aim(c.world_from_camera, height_m) for c in candidates]).reshape(-1, 2)
     near = np.linalg.norm(aims - aim, axis=1) <= NEAR_M
     return int(np.argmax(near)) if near.any() else -1
 

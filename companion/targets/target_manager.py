@@ -15,11 +15,10 @@ from companion.config import TargetConfig
 from companion.targets.detections import GROUND_STATION, Detection, clicked_name, clicked_number
 from companion.targets.pictures import RecentPictures
 from localizer.geometry.pose import Array
-from localizer.targets.bias import SharedBias
 from localizer.targets.follow import FollowedPosition, Gray, ImageFollower
 from localizer.targets.limits import RefusalReason
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.targets.track import TargetSettings, TargetTrack, pixel_of
+from localizer.targets.track import SharedBias, TargetSettings, TargetTrack, pixel_of
 from localizer.types import PoseEstimate, TargetFix, Visibility
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert

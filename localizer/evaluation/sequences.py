@@ -21,6 +21,9 @@ from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior
 
 PriorMode = Literal["first", "each"]
+# Renderings and registrations of a frame that starts from a perturbed prior, each from the last
+# result.
+_PASSES = 3
 # (frame, its truth, its index) -> the prior to begin from, None where no place is found.
 FindPlace = Callable[[Frame, Pose, int], PosePrior | None]
 
@@ -121,17 +124,15 @@ def evaluate(
     sequence: Sequence,
     perturbation: Perturbation,
     mode: PriorMode = "first",
-    passes: int = 3,
     progress: Callable[[int], None] = lambda _: None,
     find: FindPlace | None = None,
 ) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
     """Localize every frame of a sequence and compute errors and metrics.
 
     mode ``first``: only the first frame has a prior, as in the paper; ``each``: every frame starts
-    from its own perturbed true pose. passes: number of renderings and registrations of a frame that
-    starts from a perturbed prior, each from the last result. progress: called with the index of
-    each frame that is done. find: gives a prior at the start and when the camera is lost, instead
-    of the perturbed true pose. A frame outside the map or with an unusable image counts as not
+    from its own perturbed true pose. progress: called with the index of each frame that is done.
+    find: gives a prior at the start and when the camera is lost, instead of the perturbed true
+    pose. A frame outside the map or with an unusable image counts as not
     localized; `OutsideMapError` or `SequenceError` if all frames are.
     """
 
@@ -170,7 +171,7 @@ def evaluate(
                 has_prior = True
                 try:
                     outcome = localizer.track(
-                        frame, passes=passes if anew else 1, query=pending.result
+                        frame, passes=_PASSES if anew else 1, query=pending.result
                     )
                 except OutsideMapError as error:
                     if mode == "first" and anew and find is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -93,30 +93,3 @@ class SourceTree:
     imagery_date: str | None = None
     sensor: str | None = None
     up_axis: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class FlatTree:
-    """A source tree without nesting, which pickles however deep it is. nodes: parents first,
-    without their children; counts: how many children each has.
-    """
-
-    source: SourceTree
-    nodes: tuple[SourceNode, ...]
-    counts: tuple[int, ...]
-
-    @classmethod
-    def of(cls, source: SourceTree) -> FlatTree:
-        """Flatten a tree."""
-        nodes = list(source.root.walk())
-        bare = tuple(replace(node, children=[]) for node in nodes)
-        counts = tuple(len(node.children) for node in nodes)
-        return cls(replace(source, root=bare[0]), bare, counts)
-
-    def tree(self) -> SourceTree:
-        """Rebuild the tree."""
-        done: list[SourceNode] = []  # children before their parents, the first on top
-        for node, count in zip(reversed(self.nodes), reversed(self.counts), strict=True):
-            children = [done.pop() for _ in range(count)]
-            done.append(replace(node, children=children))
-        return replace(self.source, root=done[0])

@@ -17,6 +17,7 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import EARTH_RADIUS_M, LocalFrame
@@ -55,16 +56,11 @@ class TerrainGrid:
         """World z (m) at world positions, by bilinear interpolation; beyond the grid, that of its
         edge. east, north: metres, arrays of one shape.
         """
-        rows, columns = self.heights.shape
-        u = np.clip((np.asarray(east) - self.west) / self.cell_m, 0.0, columns - 1.0)
-        v = np.clip((self.north - np.asarray(north)) / self.cell_m, 0.0, rows - 1.0)
-        i = np.minimum(v.astype(np.int64), rows - 2)
-        j = np.minimum(u.astype(np.int64), columns - 2)
-        a, b = v - i, u - j
-        h = self.heights
-        upper = (1 - b) * h[i, j] + b * h[i, j + 1]
-        lower = (1 - b) * h[i + 1, j] + b * h[i + 1, j + 1]
-        found: Array = (1 - a) * upper + a * lower
+        row = (self.north - np.asarray(north)) / self.cell_m
+        column = (np.asarray(east) - self.west) / self.cell_m
+        found: Array = map_coordinates(
+            self.heights, [row, column], np.float64, order=1, mode="nearest"
+        )
         return found
 
 

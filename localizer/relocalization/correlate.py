@@ -1,9 +1,9 @@
 """Normalised correlation of one patch with a level of the overview, block by block, by FFT.
 
-A block is `SIZE` cells wide; a patch is compared at every `ORIGIN_CELLS`th origin of each at which
-the block contains it. They tile the map. What is summed over channels is a product of spectra, so
-that a patch costs one transform per channel and each block one inverse transform; the blocks' own
-spectra are kept within a budget.
+A block is `SIZE` cells wide; a patch is compared at every `ORIGIN_CELLS`th or `ROUGH_CELLS`th
+origin of each at which the block contains it. They tile the map. What is summed over channels is a
+product of spectra, so that a patch costs one transform per channel and each block one inverse
+transform; the blocks' own spectra are kept within a budget.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ _STEPS = (192, 160)  # origins of a block's side, for patches of up to 64 and 96
 # of a map's features. So the scores at every second origin determine those between them.
 _LOW = SIZE // 4
 ORIGIN_CELLS = 2
+ROUGH_CELLS = 4  # of a first pass, from the lower half of these frequencies: a quarter of the work
 _COARSE = 8  # cells of the map's energy that are summed before it is correlated
 # Spectra of so many blocks and patches are multiplied row by row, so that a row of all of them
 # stays in the cache: one block and one patch after the other took more than twice as long.
@@ -46,11 +47,6 @@ class Block:
     column: int
     step: int
 
-    @property
-    def side(self) -> int:
-        """Number of compared origins, of each side."""
-        return self.step // ORIGIN_CELLS
-
 
 @dataclass(frozen=True)
 class _Spectra:
@@ -59,15 +55,12 @@ class _Spectra:
     features: Complex64
     energy: Complex64
 
-    @property
-    def nbytes(self) -> int:
-        return self.features.nbytes + self.energy.nbytes
-
 
 @dataclass(frozen=True)
 class PatchSpectra:
-    """A patch's Fourier transform. features: (K, 2 _LOW, _LOW+1); mask: as `_Spectra.energy`; norm:
-    root of its energy; cells: side of the patch; weight: share of cells in view.
+    """A patch's Fourier transform. features: (K, 2 _LOW, SIZE / apart / 2 + 1); mask: as
+    `_Spectra.energy`; norm: root of its energy; cells: side of the patch; weight: share of cells in
+    view.
     """
 
     features: Complex64
@@ -77,12 +70,14 @@ class PatchSpectra:
     weight: float
 
 
-def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
-    """Transform a patch. features: (n, n, K) weighted; mask: (n, n) in [0, 1]."""
+def transform_patch(features: Float32, mask: Float32, apart: int = ORIGIN_CELLS) -> PatchSpectra:
+    """Transform a patch, to compare it at every `apart`th origin or less often. features: (n, n, K)
+    weighted; mask: (n, n) in [0, 1].
+    """
     n = features.shape[0]
     some = features[::ORIGIN_CELLS, ::ORIGIN_CELLS].transpose(2, 0, 1)
     # Row by row first: most rows are empty and stay so.
-    lines = scipy.fft.rfft(some, 2 * _LOW, axis=2, workers=1)
+    lines = scipy.fft.rfft(some, 2 * _LOW, axis=2, workers=1)[..., : SIZE // apart // 2 + 1]
     spectra = scipy.fft.fft(lines, 2 * _LOW, axis=1, workers=1)
     sums = _summed(np.pad(mask, (0, -n % _COARSE))) / _COARSE**2
     coarse = scipy.fft.rfft2(sums, (SIZE // _COARSE,) * 2, workers=1)
@@ -97,29 +92,19 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
 
 
 class LevelCorrelator:
-    """Correlates patches with one level; caches spectra up to `byte_budget`.
-
-    Thread-safe. A search visits all blocks repeatedly. If they do not fit, only spectra of earlier
-    searches are replaced, so that part of the blocks is always found in the cache.
-    """
+    """Correlates patches with one level; caches spectra up to `byte_budget`. Thread-safe."""
 
     def __init__(self, level: OverviewLevel, byte_budget: int) -> None:
         self.level = level
-        self._budget = byte_budget
+        one = level.features.shape[0] * 2 * _LOW * (_LOW + 1) * np.dtype(np.complex64).itemsize
+        self._most = max(1, byte_budget // one)
         self._kept: OrderedDict[Block, _Spectra] = OrderedDict()
-        self._used: dict[Block, int] = {}  # number of the search that last wanted it
-        self._search = 0
-        self._bytes = 0
         self._lock = threading.Lock()
-        # int8 squares summed as such would wrap.
-        sample = level.features[:, ::4, ::4].astype(np.float32) * level.quantum
+        # Row by row, which may be in a file; int8 squares summed as such would wrap.
+        rows = [level.features[:, r : r + 1, ::4] for r in range(0, level.shape[0], 4)]
+        sample = np.concatenate(rows, axis=1).astype(np.float32) * level.quantum
         energy = (sample**2).sum(axis=0)
         self._usual = float(energy[energy > 0].mean()) if (energy > 0).any() else 1.0
-
-    def begin(self) -> None:
-        """Begin a search; spectra that only earlier searches used may then be replaced."""
-        with self._lock:
-            self._search += 1
 
     def blocks(self, cells: int) -> list[Block]:
         """All blocks for patches of up to so many cells a side; half of the largest patch may be
@@ -133,19 +118,30 @@ class LevelCorrelator:
             for c in range(-lead, columns - lead, step)
         ]  # fmt: skip
 
-    def correlate(self, patch: PatchSpectra, block: Block) -> Float32:
-        """Scores (side, side) of the patch at the block's compared origins."""
-        return self.correlate_all([patch], [(0, block)])[0]
+    def shards(self, blocks: Sequence[Block]) -> list[Sequence[Block]]:
+        """Parts of the blocks whose spectra are kept together: compare all patches with one before
+        the next, so that each spectrum is computed once.
+        """
+        return [blocks[k : k + self._most] for k in range(0, len(blocks), self._most)]
+
+    def correlate(self, patch: PatchSpectra, block: Block, apart: int = ORIGIN_CELLS) -> Float32:
+        """Scores (n, n) of the patch at every `apart`th origin of the block."""
+        return self.correlate_all([patch], [(0, block)], apart)[0]
 
     def correlate_all(
-        self, patches: Sequence[PatchSpectra], pairs: Sequence[tuple[int, Block]]
+        self,
+        patches: Sequence[PatchSpectra],
+        pairs: Sequence[tuple[int, Block]],
+        apart: int = ORIGIN_CELLS,
     ) -> list[Float32]:
-        """Scores (side, side) of each pair: number of a patch, and the block. At most
-        `PATCHES_TOGETHER` patches and `BLOCKS_TOGETHER` different blocks.
+        """Scores (n, n) of each pair: number of a patch, and the block. At most `PATCHES_TOGETHER`
+        patches and `BLOCKS_TOGETHER` different blocks. apart: cells between compared origins,
+        `ORIGIN_CELLS` or `ROUGH_CELLS`.
         """
         blocks = {b: k for k, b in enumerate(dict.fromkeys(b for _, b in pairs))}
-        spectra = [self._spectra(b) for b in blocks]
-        products = np.empty((len(pairs), 2 * _LOW, _LOW + 1), np.complex64)
+        spectra = [self.prepare(b) for b in blocks]
+        n = SIZE // apart
+        products = np.empty((len(pairs), n, n // 2 + 1), np.complex64)
         _multiplied(
             _filled([s.features for s in spectra], BLOCKS_TOGETHER),
             _filled([p.features for p in patches], PATCHES_TOGETHER),
@@ -153,22 +149,24 @@ class LevelCorrelator:
             products.view(np.float32),
         )
         return [
-            self._normalised(product, spectra[blocks[b]], patches[n], b.side)
+            self._normalised(product, spectra[blocks[b]], patches[n], b.step // apart)
             for product, (n, b) in zip(products, pairs, strict=True)
         ]
 
     def _normalised(
         self, product: Complex64, block: _Spectra, patch: PatchSpectra, side: int
     ) -> Float32:
-        """Scores (side, side) from the product of the spectra, which is overwritten."""
+        """Scores (side, side) from the product (n, n // 2 + 1), which is overwritten."""
+        n = product.shape[0]
         # Only the first rows are origins: the others' last transform is left out.
         columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:side]
-        raw = scipy.fft.irfft(columns, 2 * _LOW, axis=1, workers=1)
+        raw = scipy.fft.irfft(columns, n, axis=1, workers=1)
         small = SIZE // _COARSE
         energy = scipy.fft.irfft2(block.energy * patch.mask.conj(), (small, small), workers=1)
         least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
         scores = np.empty((side, side), np.float32)
-        _normalised(raw, energy, np.float32(least), np.float32(max(patch.norm, 1e-9)), scores)
+        norm = max(patch.norm, 1e-9) * (2 * _LOW / n) ** 2  # fewer frequencies: a smaller divisor
+        _normalised(raw, energy, np.float32(least), np.float32(norm), scores)
         return scores
 
     def warm_up(self) -> None:
@@ -177,30 +175,19 @@ class LevelCorrelator:
         patch = transform_patch(np.ones((8, 8, channels), np.float32), np.ones((8, 8), np.float32))
         self.correlate(patch, self.blocks(patch.cells)[0])
 
-    def _spectra(self, block: Block) -> _Spectra:
+    def prepare(self, block: Block) -> _Spectra:
+        """The block's spectra, from the cache or computed."""
         with self._lock:
             kept = self._kept.get(block)
             if kept is not None:
                 self._kept.move_to_end(block)
-                self._used[block] = self._search
                 return kept
         made = self._transform(block)
         with self._lock:
-            if block not in self._kept and self._has_room(made.nbytes):
-                self._kept[block] = made
-                self._used[block] = self._search
-                self._bytes += made.nbytes
+            self._kept[block] = made
+            if len(self._kept) > self._most:
+                self._kept.popitem(last=False)
         return made
-
-    def _has_room(self, nbytes: int) -> bool:
-        """Whether there is room, after dropping earlier searches' spectra. Needs the lock."""
-        while self._bytes + nbytes > self._budget and self._kept:
-            oldest = next(iter(self._kept))
-            if self._used[oldest] == self._search:
-                return False
-            self._bytes -= self._kept.pop(oldest).nbytes
-            del self._used[oldest]
-        return self._bytes + nbytes <= self._budget
 
     def _transform(self, block: Block) -> _Spectra:
         level = self.level
@@ -215,14 +202,15 @@ class LevelCorrelator:
             )
         energy = _summed((window**2).sum(axis=0))
         return _Spectra(
-            _low(scipy.fft.rfft2(window, workers=1)),
+            _low(scipy.fft.rfft(window, axis=2, workers=1)),
             scipy.fft.rfft2(energy, workers=1).astype(np.complex64, copy=False),
         )
 
 
-def _low(spectra: NDArray[Any]) -> Complex64:
-    """The low frequencies (K, 2 _LOW, _LOW+1) of spectra (K, SIZE, at least _LOW+1)."""
-    kept = [spectra[:, :_LOW, : _LOW + 1], spectra[:, -_LOW:, : _LOW + 1]]
+def _low(lines: NDArray[Any]) -> Complex64:
+    """The low frequencies (K, 2 _LOW, _LOW+1) of rows' spectra (K, SIZE, at least _LOW+1)."""
+    spectra = scipy.fft.fft(lines[..., : _LOW + 1], axis=1, workers=1)
+    kept = [spectra[:, :_LOW], spectra[:, -_LOW:]]
     return np.concatenate(kept, axis=1).astype(np.complex64, copy=False)
 
 
@@ -242,13 +230,15 @@ def _filled(spectra: Sequence[Complex64], count: int) -> tuple[Float32, ...]:
 def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
     """Sum over channels of block * conj(patch) for each pair (m, 3): block, patch, place in out.
 
-    blocks, patches: (K, 2 _LOW, 2 n) each, out: (., 2 _LOW, 2 n) float32, real and imaginary in
-    turn.
+    blocks, patches: (K, 2 _LOW, 2 _LOW + 2) each, out: (., n, n + 2) of the lowest frequencies;
+    float32, real and imaginary in turn.
     """
-    channels, rows, width = blocks[0].shape
-    for i in range(rows):
+    channels, all_rows, _ = blocks[0].shape
+    _, rows, width = out.shape
+    for r in range(rows):
+        i = r if r < rows // 2 else r + all_rows - rows
         for m in range(pairs.shape[0]):
-            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], i]
+            a, b, o = blocks[pairs[m, 0]], patches[pairs[m, 1]], out[pairs[m, 2], r]
             o[:] = 0
             for k in range(channels):
                 x, y = a[k, i], b[k, i]
@@ -260,7 +250,7 @@ def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _normalised(raw, energy, least, norm, out):  # type: ignore[no-untyped-def]
     """Sample k of the coarse energy belongs to cell 8 k: between them it is interpolated."""
-    each = _COARSE // ORIGIN_CELLS
+    each = _COARSE * raw.shape[1] // SIZE
     step = np.float32(1.0 / each)
     for i in range(out.shape[0]):
         p = i // each

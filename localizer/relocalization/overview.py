@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import logging
 import math
 import os
+import threading
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
-import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
@@ -27,7 +30,7 @@ from localizer.errors import MapCacheError
 from localizer.features.extractor import FeatureExtractor, model_key
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
-from localizer.plain_files import plain_bytes
+from localizer.plain_files import open_plain
 from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.render.base import MapRenderer
 from localizer.render.topview import render_top_view
@@ -51,6 +54,7 @@ _SAMPLE_SQUARES = 24  # that the principal components are computed from
 _GROUND_PERCENTILE = 30  # of the heights in a sample: lower than roofs and trees
 _LEAST_SHARE = 0.9  # of a square's cell that the map must cover to be compared
 
+_READ_BYTES = 1 << 20  # at a time, while a file is checked
 _SEARCHED_BYTES = 5  # of the finest level's cell: its scores, their trials, and copies
 _MOST_OF_MEMORY = 0.5  # of what is free
 
@@ -69,6 +73,32 @@ class Projection:
         return np.asarray((features - self.mean) @ self.basis, np.float32)
 
 
+class FeatureFile:
+    """An int8 array (K, H, W) in a file, of which only the rows read last are in memory.
+    Thread-safe.
+    """
+
+    def __init__(self, file: BinaryIO, offset: int, shape: tuple[int, int, int]) -> None:
+        self.shape, self.nbytes = shape, math.prod(shape)
+        self._descriptor, self._offset = os.dup(file.fileno()), offset
+        weakref.finalize(self, os.close, self._descriptor)
+        self._rows, self._strip = (0, 0), np.empty((shape[0], 0, shape[2]), np.int8)
+        self._lock = threading.Lock()
+
+    def __getitem__(self, at: tuple[slice, slice, slice]) -> NDArray[np.int8]:
+        """All channels of rows that follow each other, and of columns; OSError."""
+        channels, height, width = self.shape
+        first, last, _ = at[1].indices(height)
+        with self._lock:
+            if self._rows != (first, last):
+                size = (last - first) * width
+                starts = (self._offset + (k * height + first) * width for k in range(channels))
+                data = b"".join(os.pread(self._descriptor, size, start) for start in starts)
+                strip = np.frombuffer(data, np.int8).reshape(channels, last - first, width)
+                self._rows, self._strip = (first, last), strip
+            return self._strip[:, :, at[2]]
+
+
 @dataclass(frozen=True, eq=False)
 class OverviewLevel:
     """One scale. features: (K, H, W) int8 times `quantum`, confidence included, less their local
@@ -76,7 +106,7 @@ class OverviewLevel:
     ground: (H / 16, W / 16) float32 world z, NaN without map; west, north: world m of the corner.
     """
 
-    features: NDArray[np.int8]
+    features: NDArray[np.int8] | FeatureFile
     ground: Float32
     projection: Projection
     west: float
@@ -120,7 +150,7 @@ class MapOverview:
 
     @property
     def nbytes(self) -> int:
-        """Bytes in memory."""
+        """Bytes in memory or on disk."""
         return sum(level.features.nbytes + level.ground.nbytes for level in self.levels)
 
 
@@ -163,10 +193,10 @@ def open_overview(
     mark_used(folder)
     levels, is_new = [], False
     squares = [_squares(cache, gsd) for gsd in GSD_M]
-    _require_memory(squares)
+    paths = [folder / f"{gsd:g}.safetensors" for gsd in GSD_M]
+    _require_memory(squares, computed=not all(path.exists() for path in paths))
     total, done = sum(len(s.corners) for s in squares), 0
-    for plan in squares:
-        path = folder / f"{plan.gsd_m:g}.safetensors"
+    for plan, path in zip(squares, paths, strict=True):
         level = _read(path, plan.gsd_m)
         if level is None:
             level = _compute(
@@ -178,7 +208,8 @@ def open_overview(
             )
             if level is None:
                 return None
-            _write(path, level)
+            write_level(path, level)
+            level = _read(path, plan.gsd_m) or level
             is_new = True
         done += len(plan.corners)
         progress(done, total)
@@ -213,10 +244,12 @@ class _Squares:
         )
 
 
-def _require_memory(squares: Sequence[_Squares]) -> None:
-    """`MapCacheError` if a search would need more than half of the free memory."""
+def _require_memory(squares: Sequence[_Squares], computed: bool) -> None:
+    """`MapCacheError` if a search would need more than half of the free memory. computed: the
+    overview, too.
+    """
     cells = [s.rows * s.columns for s in squares]
-    wanted, free = CHANNELS * sum(cells) + _SEARCHED_BYTES * cells[0], available_bytes()
+    wanted, free = _SEARCHED_BYTES * cells[0] + computed * CHANNELS * sum(cells), available_bytes()
     if free is not None and wanted > _MOST_OF_MEMORY * free:
         raise MapCacheError(
             f"a search of {cells[0] * (GSD_M[0] * STRIDE) ** 2 / 1e6:.0f} km² takes "
@@ -340,37 +373,50 @@ def _principal(squares: Iterable[_SquareFeatures]) -> Projection:
 def _read(path: Path, gsd_m: float) -> OverviewLevel | None:
     """A level from disk; None if there is none, or a damaged one (named in the log)."""
     try:
-        data = plain_bytes(path, None)
+        with open_plain(path) as file:
+            stated, found = file.read(32), hashlib.sha256()
+            while some := file.read(_READ_BYTES):
+                found.update(some)
+            if found.digest() == stated:
+                return _level(file, gsd_m)
+        logger.warning("%s: damaged: the overview is made again", path)
     except FileNotFoundError:
-        return None
+        pass
     except OSError as error:
         logger.warning("%s: cannot be read (%s): the overview is made again", path, error)
-        return None
-    digest, content = data[:32], data[32:]
-    if hashlib.sha256(content).digest() != digest:
-        logger.warning("%s: damaged: the overview is made again", path)
-        return None
-    try:
-        a = safetensors.numpy.load(content)
-        corner = a["corner"].astype(np.float64)
-        return OverviewLevel(
-            a["features"],
-            a["ground"],
-            Projection(a["mean"], a["basis"]),
-            float(corner[0]),
-            float(corner[1]),
-            gsd_m,
-        )
-    except (safetensors.SafetensorError, KeyError, IndexError) as error:
-        logger.warning("%s: no overview (%s): it is made again", path, error)
-        return None
+    return None
 
 
-def _write(path: Path, level: OverviewLevel) -> None:
-    """Write atomically: hash and arrays to a temporary name, then rename."""
+def _level(file: BinaryIO, gsd_m: float) -> OverviewLevel:
+    """A level in the form of safetensors after the hash, without its features in memory."""
+    file.seek(32)
+    header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    start = file.tell()
+
+    def array(name: str, kind: type[np.floating[Any]]) -> NDArray[Any]:
+        first, last = header[name]["data_offsets"]
+        file.seek(start + first)
+        values: NDArray[Any] = np.frombuffer(file.read(last - first), kind)
+        shaped: NDArray[Any] = values.reshape(header[name]["shape"])
+        return shaped
+
+    corner = array("corner", np.float64)
+    features = header["features"]
+    return OverviewLevel(
+        FeatureFile(file, start + features["data_offsets"][0], tuple(features["shape"])),
+        array("ground", np.float32),
+        Projection(array("mean", np.float32), array("basis", np.float32)),
+        float(corner[0]),
+        float(corner[1]),
+        gsd_m,
+    )
+
+
+def write_level(path: Path, level: OverviewLevel) -> None:
+    """Write hash and arrays atomically, with a temporary name; if impossible, only log it."""
     content = safetensors.numpy.save(
         {
-            "features": np.ascontiguousarray(level.features),
+            "features": np.ascontiguousarray(level.features[:, :, :]),
             "ground": np.ascontiguousarray(level.ground),
             "mean": level.projection.mean,
             "basis": level.projection.basis,
@@ -381,7 +427,8 @@ def _write(path: Path, level: OverviewLevel) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with new.open("wb") as file:
-            file.write(hashlib.sha256(content).digest() + content)
+            file.write(hashlib.sha256(content).digest())
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         new.replace(path)

@@ -1,11 +1,17 @@
-"""Exhaustive search over headings, heights above ground, and positions of the region."""
+"""Exhaustive search over headings, heights above ground, and positions of the region.
+
+If there is much to compare, every pair of a trial (heading and height) and a block of the map is
+compared roughly first, and only the best pairs at the origins between them.
+"""
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import cv2
@@ -22,9 +28,9 @@ from localizer.relocalization.correlate import (
     MOST_CELLS,
     ORIGIN_CELLS,
     PATCHES_TOGETHER,
+    ROUGH_CELLS,
     Block,
     LevelCorrelator,
-    PatchSpectra,
     transform_patch,
 )
 from localizer.relocalization.overview import (
@@ -42,13 +48,16 @@ from localizer.relocalization.patch import (
     rectify,
     with_heading,
 )
-from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
+from localizer.relocalization.types import PlaceCandidate, PlaceQuery
 from localizer.types import Float32, Image
+
+Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 
 _MOST_PX = MOST_CELLS * STRIDE  # of a patch's side
 _UNSEEN_PX = 9  # next to what is not seen, features are of the filling
 _SUPPRESSED_M = 12.0  # about a candidate, whose neighbours are no other place
 _LEAST_HEIGHT_M = 10.0
+_MOST_PAIRS = 512  # of a trial and a block that are compared at every `ORIGIN_CELLS`th origin
 _HEADINGS_TOGETHER = 3  # that share an extraction: its features are turned by up to 6 degrees
 _AT = np.arange(-3.0, 4.0) - np.array([[-0.5], [0.0], [0.5]])
 _TAPS = np.sinc(_AT) * np.sinc(_AT / 3) * (np.abs(_AT) < 3)  # Lanczos: half a sample to each side
@@ -183,28 +192,26 @@ def search(
     seen = footprint(view.camera, query.rotation, 1.0, largest / float(heights[-1]))
     level = level_for(tuple(c.level for c in correlators), seen.side_m * float(heights[0]))
     correlator = next(c for c in correlators if c.level is level)
-    correlator.begin()
     run = _MapSearch(view, query, correlator, extractor, config, seen, heights, ())
     run = replace(run, blocks=tuple(correlator.blocks(run.cells(float(heights[-1])))))
     run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
-    groups = shared_extractions(heights, config.extraction_ratio)
-    turns = heading_offsets(query, config)
-    starts = range(0, len(turns), _HEADINGS_TOGETHER)
-    jobs = [(turns[k : k + _HEADINGS_TOGETHER], g) for g in groups for k in starts]
-    trials: list[BlockScores] = []
-    scores = run.empty()
 
-    def work(job: tuple[Array, list[int]]) -> list[BlockScores] | None:
-        return None if should_stop() else run.at_headings(*job, should_stop)
+    def each(work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        def one(item: Any) -> Any:
+            if should_stop():
+                raise _CancelledError
+            return work(item)
 
-    results = map(work, jobs) if pool is None else pool.map(work, jobs)
-    for result in results:
-        if result is None or should_stop():
-            return None
-        for found in result:
-            run.merge(scores, len(trials), found)
-            trials.append(replace(found, blocks=[]))
-    return run.candidates(scores, trials)
+        return map(one, items) if pool is None else pool.map(one, items)
+
+    try:
+        return run.found(each)
+    except _CancelledError:
+        return None
+
+
+class _CancelledError(Exception):
+    """The search was cancelled."""
 
 
 def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
@@ -221,20 +228,6 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 
 @dataclass(frozen=True)
-class BlockScores:
-    """Scores (side, side) of one trial (heading and height) at the origins of each block that suits
-    its height.
-
-    noise: root mean square of the trial's scores over ground. Trials are compared by score divided
-    by noise: low above a hill few cells are seen, and some position always looks similar.
-    """
-
-    trial: Rectification
-    noise: float
-    blocks: list[tuple[Block, Float32]]
-
-
-@dataclass(frozen=True)
 class SuitedOrigins:
     """A block's origins for one height. mask: those that it suits, every `GROUND_CELLS`; known:
     share of them all that is over ground.
@@ -245,12 +238,57 @@ class SuitedOrigins:
 
 
 @dataclass(frozen=True)
+class Trial:
+    """A heading and height, and the blocks with an origin that suits them."""
+
+    number: int
+    of: Rectification
+    blocks: dict[Block, SuitedOrigins]
+
+
+@dataclass(frozen=True)
+class Look:
+    """The trials that share one extraction. features: (n, n, K) of the ground as rectified `of`;
+    mask: (n, n).
+    """
+
+    of: Rectification
+    features: Float32
+    mask: Float32
+    trials: tuple[Trial, ...]
+
+
+@dataclass(frozen=True)
+class PairScores:
+    """Scores (n, n) of a trial at a block's compared origins, -1 where they do not suit it. power:
+    mean square of all its scores.
+    """
+
+    trial: int
+    block: Block
+    power: float
+    scores: Float32
+
+
+def trial_noise(trials: Sequence[Trial], power: Iterable[Sequence[Any]]) -> Array:
+    """Root mean square (n,) of each trial's scores over ground. Trials are compared by score
+    divided by noise: low above a hill few cells are seen, and some position always looks similar.
+
+    power: of each pair the number of the trial, the mean square, and more.
+    """
+    numbers, powers, *_ = zip(*power, strict=True)
+    known = [sum(origins.known for origins in trial.blocks.values()) for trial in trials]
+    total = np.bincount(numbers, powers, len(trials))
+    return np.asarray(np.maximum(np.sqrt(total / np.array(known)), 1e-6))
+
+
+@dataclass(frozen=True)
 class _MapSearch:
     """Data of one search. blocks: of the map; suited: for each height, the blocks with an origin
     that it suits.
 
     Above 200 lines and 15 public methods: one correlation, from a heading's patch to the scores of
-    all blocks.
+    all blocks. Where `each` is an argument, it is `map` that may be cancelled and use threads.
     """
 
     view: SearchView
@@ -273,60 +311,101 @@ class _MapSearch:
         shape = tuple(-(-(n + 2 * self.lead) // ORIGIN_CELLS) for n in (rows, columns))
         return Scores(np.full(shape, -1.0, np.float32), np.zeros(shape, np.int32))
 
-    def at_headings(
-        self, turns: Array, group: list[int], should_stop: Callable[[], bool]
-    ) -> list[BlockScores] | None:
-        """Correlate headings and heights that share an extraction with all their blocks."""
-        wanted = []
-        for heading in turns:
-            for scale in group:
-                trial = self.trial(float(heading), float(self.heights[scale]))
-                suited = self.suited[scale].items()
-                if blocks := {b: origins for b, origins in suited if self.meets(b, trial)}:
-                    wanted.append((trial, blocks))
-        if not wanted:
+    def found(self, each: Each) -> list[PlaceCandidate]:
+        """The search's result."""
+        jobs = self.jobs()
+        patches = each(self.patch, [middle for middle, _ in jobs])
+        looks = [
+            Look(of, features, mask, trials)
+            for (of, trials), (features, mask) in zip(jobs, patches, strict=True)
+        ]
+        trials = [trial for look in looks for trial in look.trials]
+        if not trials:
             return []
-        middle = self.trial(float(turns.mean()), float(self.heights[group[len(group) // 2]]))
-        features, mask = self.patch(middle)
-        found: list[BlockScores] = []
-        for first in range(0, len(wanted), PATCHES_TOGETHER):
-            some = wanted[first : first + PATCHES_TOGETHER]
-            patches = [
-                transform_patch(*(fitted(x, middle, trial) for x in (features, mask)))
-                for trial, _ in some
+        wanted = [trial.blocks for trial in trials]
+        rough: list[tuple[int, float, float, Block]] = []
+        if sum(map(len, wanted)) > 4 * _MOST_PAIRS:  # below, a rough pass saves nothing
+            rough = [
+                (p.trial, p.power, float(p.scores.max()), p.block)
+                for p in self.compare(looks, wanted, ROUGH_CELLS, each)
             ]
-            scores = self._correlate(patches, some, should_stop)
-            if scores is None:
-                return None
-            found += scores
+            noise = trial_noise(trials, rough)
+            wanted = [{} for _ in trials]
+            for n, _, _, block in heapq.nlargest(
+                _MOST_PAIRS, rough, key=lambda x: x[2] / noise[x[0]]
+            ):
+                wanted[n][block] = trials[n].blocks[block]
+        pairs = list(self.compare(looks, wanted, ORIGIN_CELLS, each))
+        if not rough:
+            noise = trial_noise(trials, [(p.trial, p.power) for p in pairs])
+        scores = self.empty()
+        for pair in pairs:
+            self.merge(scores, pair, float(noise[pair.trial]))
+        return self.candidates(scores, trials, noise)
+
+    def jobs(self) -> list[tuple[Rectification, tuple[Trial, ...]]]:
+        """What is extracted, and the trials that share it."""
+        turns = heading_offsets(self.query, self.config)
+        found, count = [], 0
+        for group in shared_extractions(self.heights, self.config.extraction_ratio):
+            for first in range(0, len(turns), _HEADINGS_TOGETHER):
+                some, trials = turns[first : first + _HEADINGS_TOGETHER], []
+                for heading, scale in product(some, group):
+                    of = self.trial(float(heading), float(self.heights[scale]))
+                    suited = self.suited[scale].items()
+                    if blocks := {b: origins for b, origins in suited if self.meets(b, of)}:
+                        trials.append(Trial(count, of, blocks))
+                        count += 1
+                if trials:
+                    height = float(self.heights[group[len(group) // 2]])
+                    found.append((self.trial(float(some.mean()), height), tuple(trials)))
         return found
+
+    def compare(
+        self, looks: Sequence[Look], wanted: Sequence[dict[Block, SuitedOrigins]], apart: int,
+        each: Each,
+    ) -> Iterator[PairScores]:  # fmt: skip
+        """Compare each trial with its wanted blocks at every `apart`th origin."""
+        union = set().union(*wanted)
+        for shard in self.correlator.shards([b for b in self.blocks if b in union]):
+            list(each(self.correlator.prepare, shard))
+
+            def one(look: Look, shard: Sequence[Block] = shard) -> list[PairScores]:
+                return self._correlate(look, wanted, shard, apart)
+
+            for pairs in each(one, looks):
+                yield from pairs
 
     def _correlate(
         self,
-        patches: list[PatchSpectra],
-        wanted: list[tuple[Rectification, dict[Block, SuitedOrigins]]],
-        should_stop: Callable[[], bool],
-    ) -> list[BlockScores] | None:
-        """Correlate patches (at most `PATCHES_TOGETHER`), each with its own blocks."""
-        scores: list[list[tuple[Block, Float32]]] = [[] for _ in wanted]
-        power = [0.0] * len(wanted)
-        union = [b for b in self.blocks if any(b in blocks for _, blocks in wanted)]
-        for first in range(0, len(union), BLOCKS_TOGETHER):
-            if should_stop():
-                return None
-            some = union[first : first + BLOCKS_TOGETHER]
-            pairs = [(n, b) for b in some for n, (_, blocks) in enumerate(wanted) if b in blocks]
-            for (n, block), raw in zip(
-                pairs, self.correlator.correlate_all(patches, pairs), strict=True
-            ):
-                trial, blocks = wanted[n]
-                power[n] += float(np.vdot(raw, raw)) / raw.size
-                scores[n].append((block, self.masked(raw, block, trial, blocks[block].mask)))
-        known = [sum(origins.known for origins in blocks.values()) for _, blocks in wanted]
-        return [
-            BlockScores(trial, max(math.sqrt(power[n] / known[n]), 1e-6), scores[n])
-            for n, (trial, _) in enumerate(wanted)
-        ]
+        look: Look,
+        wanted: Sequence[dict[Block, SuitedOrigins]],
+        shard: Sequence[Block],
+        apart: int,
+    ) -> list[PairScores]:
+        found: list[PairScores] = []
+        for first in range(0, len(look.trials), PATCHES_TOGETHER):
+            some = look.trials[first : first + PATCHES_TOGETHER]
+            blocks = [b for b in shard if any(b in wanted[trial.number] for trial in some)]
+            if not blocks:
+                continue
+            patches = [
+                transform_patch(
+                    fitted(look.features, look.of, t.of), fitted(look.mask, look.of, t.of), apart
+                )
+                for t in some
+            ]
+            for k in range(0, len(blocks), BLOCKS_TOGETHER):
+                pairs = [
+                    (n, b) for b in blocks[k : k + BLOCKS_TOGETHER] for n, trial in enumerate(some)
+                    if b in wanted[trial.number]
+                ]  # fmt: skip
+                scores = self.correlator.correlate_all(patches, pairs, apart)
+                for (n, block), raw in zip(pairs, scores, strict=True):
+                    power = float(np.vdot(raw, raw)) / raw.size
+                    masked = self.masked(raw, block, some[n], apart)
+                    found.append(PairScores(some[n].number, block, power, masked))
+        return found
 
     def trial(self, heading: float, height: float) -> Rectification:
         c, s = np.cos(heading), np.sin(heading)
@@ -393,23 +472,20 @@ class _MapSearch:
         mask = np.asarray((low <= height) & (height <= high))
         return SuitedOrigins(mask, float(np.isfinite(ground).mean()))
 
-    def masked(
-        self, scores: Float32, block: Block, trial: Rectification, suits: NDArray[np.bool_]
-    ) -> Float32:
+    def masked(self, scores: Float32, block: Block, trial: Trial, apart: int) -> Float32:
+        suits = trial.blocks[block].mask
         if not suits.all():
-            each = GROUND_CELLS // ORIGIN_CELLS
-            fine = suits.astype(np.uint8).repeat(each, axis=0).repeat(each, axis=1)
+            side = GROUND_CELLS // apart
+            fine = suits.astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
             fine = cv2.dilate(fine, np.ones((3, 3)))  # the last maxima are interpolated, too
             scores = np.where(fine, scores, np.float32(-1.0))
         if self.query.region is not None:
-            scores = np.where(self.inside(block, trial, self.query.region), scores, -1.0)
+            at = np.arange(0, block.step, apart)
+            rows, columns = at + block.row, at + block.column
+            grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+            inside = self.query.region.contains(self.camera_at(grid, trial.of))
+            scores = np.where(inside, scores, -1.0)
         return scores.astype(np.float32, copy=False)
-
-    def inside(self, block: Block, trial: Rectification, region: SearchRegion) -> NDArray[np.bool_]:
-        at = np.arange(0, block.step, ORIGIN_CELLS)
-        rows, columns = at + block.row, at + block.column
-        grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
-        return region.contains(self.camera_at(grid, trial))
 
     def camera_at(self, origin: NDArray[Any], trial: Rectification) -> Array:
         """East and north (..., 2) of the camera whose patch begins at cell (..., 2)."""
@@ -419,18 +495,21 @@ class _MapSearch:
         north = level.north - middle[..., 0] - trial.centre[1]
         return np.stack([east, north], axis=-1)
 
-    def merge(self, scores: Scores, trial: int, found: BlockScores) -> None:
+    def merge(self, scores: Scores, pair: PairScores, noise: float) -> None:
         rows, columns = scores.best.shape
-        for block, values in found.blocks:
-            r, c = ((k + self.lead) // ORIGIN_CELLS for k in (block.row, block.column))
-            h, w = min(block.side, rows - r), min(block.side, columns - c)
-            window = np.s_[r : r + h, c : c + w]
-            weighed = values[:h, :w] / np.float32(found.noise)
-            better = weighed > scores.best[window]
-            scores.best[window][better] = weighed[better]
-            scores.trial[window][better] = trial
+        r, c = ((k + self.lead) // ORIGIN_CELLS for k in (pair.block.row, pair.block.column))
+        h, w = (
+            min(n, most) for n, most in zip(pair.scores.shape, (rows - r, columns - c), strict=True)
+        )
+        window = np.s_[r : r + h, c : c + w]
+        weighed = pair.scores[:h, :w] / np.float32(noise)
+        better = weighed > scores.best[window]
+        scores.best[window][better] = weighed[better]
+        scores.trial[window][better] = pair.trial
 
-    def candidates(self, scores: Scores, trials: list[BlockScores]) -> list[PlaceCandidate]:
+    def candidates(
+        self, scores: Scores, trials: Sequence[Trial], noise: Array
+    ) -> list[PlaceCandidate]:
         """The highest peaks of `scores`, no two closer than `_SUPPRESSED_M`, in their order."""
         best, moved = peaks(scores.best)
         reach = max(1, round(_SUPPRESSED_M / (self.correlator.level.cell_m * ORIGIN_CELLS)))
@@ -439,8 +518,8 @@ class _MapSearch:
             i, j = np.unravel_index(int(np.argmax(best)), best.shape)
             if best[i, j] <= 0:
                 break
-            chosen = trials[int(scores.trial[i, j])]
-            trial, score = chosen.trial, float(best[i, j]) * chosen.noise
+            number = int(scores.trial[i, j])
+            trial, score = trials[number].of, float(best[i, j] * noise[number])
             origin = np.array([i, j]) * ORIGIN_CELLS - self.lead
             place = self.camera_at(origin + moved[i, j] * ORIGIN_CELLS, trial)
             if self.query.region is not None and not self.query.region.contains(place):

@@ -1,4 +1,4 @@
-"""The renderer protocol, and the common part of its backends."""
+"""The renderer, as far as its backends have it in common."""
 
 from __future__ import annotations
 
@@ -58,10 +58,15 @@ class StaticTiles:
         return bounding_spheres(self.meshes)
 
 
-class MapRenderer(Protocol):
-    """Renders a map's RGB and depth. One thread renders at a time."""
+class MapRenderer(ABC):
+    """Renders a map's RGB and depth: gets a view's tiles from a provider and draws them. One thread
+    renders at a time.
+    """
 
     name: str
+
+    def __init__(self, streamer: TileProvider) -> None:
+        self.streamer = streamer
 
     def render(
         self,
@@ -77,38 +82,6 @@ class MapRenderer(Protocol):
         is in memory; otherwise what is in memory is drawn, and missing tiles are loaded for later
         views. The returned arrays belong to the caller.
         """
-        ...
-
-    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """Load the tiles of future views (world_from_camera); returns at once."""
-        ...
-
-    def warm_up(self) -> None:
-        """Compile what rendering needs, so that the first view is not delayed."""
-        ...
-
-    def close(self) -> None:
-        """Release threads and devices."""
-        ...
-
-
-class TileRenderer(ABC):
-    """Common part of the backends: gets a view's tiles from a provider and draws them."""
-
-    name: str
-
-    def __init__(self, streamer: TileProvider) -> None:
-        self.streamer = streamer
-
-    def render(
-        self,
-        world_from_camera: Pose,
-        camera: Camera,
-        extra: Sequence[TileMesh] = (),
-        *,
-        wait: bool = False,
-    ) -> RenderedView:
-        """See `MapRenderer.render`."""
         require_pinhole(camera)
         meshes = list(self.streamer.select(world_from_camera, camera, wait=wait))
         if extra:
@@ -125,11 +98,13 @@ class TileRenderer(ABC):
         """
 
     def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """See `MapRenderer.prefetch`."""
+        """Load the tiles of future views (world_from_camera); returns at once."""
         self.streamer.prefetch(views, camera)
 
     def warm_up(self) -> None:
-        """See `MapRenderer.warm_up`. numba: seconds the first time, then cached on disk."""
+        """Compile what rendering needs, so that the first view is not delayed. numba: seconds the
+        first time, then cached on disk.
+        """
         corners = np.array([[-1, -1, 2], [1, -1, 2], [0, 1, 0.1]], np.float32)
         white = np.full((8, 8, 3), 255, np.uint8)
         faces = np.array([[0, 1, 2]], np.int32)

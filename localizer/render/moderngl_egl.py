@@ -22,7 +22,7 @@ from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.tile import TileMesh
-from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
+from localizer.render.base import SKY, MapRenderer, TileProvider, clip_from_camera
 from localizer.types import RenderedView
 
 _EGL: dict[str, Any] = {"backend": "egl"}
@@ -75,23 +75,10 @@ class _Uploaded:
             item.release()
 
 
-@dataclass(eq=False)
-class _Framebuffer:
-    """A framebuffer of one size."""
-
-    colour: Any
-    depth: Any
-    framebuffer: Any
-
-
-class ModernGLRenderer(TileRenderer):
+class ModernGLRenderer(MapRenderer):
     """Draws tiles with OpenGL. Only the thread that made it may use it."""
 
-    def __init__(
-        self,
-        streamer: TileProvider,
-        byte_budget: int = 1 << 30,
-    ) -> None:
+    def __init__(self, streamer: TileProvider, byte_budget: int = 1 << 30) -> None:
         """Open an EGL context; raises `RenderError` where there is none."""
         super().__init__(streamer)
         try:
@@ -110,7 +97,7 @@ class ModernGLRenderer(TileRenderer):
         self._context.enable(moderngl.DEPTH_TEST)
         self._uploaded: OrderedDict[int, _Uploaded] = OrderedDict()  # least recent first
         self._bytes = 0
-        self._targets: dict[tuple[int, int], _Framebuffer] = {}
+        self._targets: dict[tuple[int, int], tuple[Any, Any]] = {}  # by size: buffer, depth
 
     @property
     def is_software(self) -> bool:
@@ -122,10 +109,10 @@ class ModernGLRenderer(TileRenderer):
     ) -> RenderedView:
         """Draw exactly these meshes. `RenderError` on a thread that did not make the renderer."""
         self._assert_owner()
-        target = self._target(camera.width, camera.height)
-        target.framebuffer.use()
-        target.framebuffer.clear(*self._sky, 0.0, depth=1.0)
-        target.depth.write(np.zeros((camera.height, camera.width), np.float32))
+        framebuffer, depths = self._target(camera.width, camera.height)
+        framebuffer.use()
+        framebuffer.clear(*self._sky, 0.0, depth=1.0)
+        depths.write(np.zeros((camera.height, camera.width), np.float32))
         self._program["projection"].write(clip_from_camera(camera).T.astype("f4").tobytes())
         camera_from_world = world_from_camera.inverse
         for mesh in meshes:
@@ -140,8 +127,8 @@ class ModernGLRenderer(TileRenderer):
         self._finish()  # through ctypes: waits without the GIL, which reading back would hold
         rgba = np.empty((camera.height, camera.width, 4), np.uint8)
         depth = np.empty((camera.height, camera.width), np.float32)
-        target.framebuffer.read_into(rgba, components=4, attachment=0)
-        target.framebuffer.read_into(depth, components=1, attachment=1, dtype="f4")
+        framebuffer.read_into(rgba, components=4, attachment=0)
+        framebuffer.read_into(depth, components=1, attachment=1, dtype="f4")
         rgb = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB).astype(np.uint8, copy=False)
         return RenderedView(rgb, depth, world_from_camera, camera)
 
@@ -160,13 +147,13 @@ class ModernGLRenderer(TileRenderer):
         if threading.get_ident() != self._owner:
             raise RenderError("an OpenGL renderer was used by a thread that did not make it")
 
-    def _target(self, width: int, height: int) -> _Framebuffer:
+    def _target(self, width: int, height: int) -> tuple[Any, Any]:
         if (width, height) not in self._targets:
             colour = self._context.texture((width, height), 4, dtype="f1")
             depth = self._context.texture((width, height), 1, dtype="f4")
             buffer = self._context.depth_texture((width, height))
             framebuffer = self._context.framebuffer([colour, depth], buffer)
-            self._targets[width, height] = _Framebuffer(colour, depth, framebuffer)
+            self._targets[width, height] = framebuffer, depth
         return self._targets[width, height]
 
     def _on_gpu(self, mesh: TileMesh) -> _Uploaded:

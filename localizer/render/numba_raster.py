@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import TileMesh
-from localizer.render.base import NEAR_M, SKY, TileProvider, TileRenderer
+from localizer.render.base import NEAR_M, SKY, MapRenderer, TileProvider
 from localizer.render.raster_kernels import (
     clear,
     clip,
@@ -48,7 +48,7 @@ class _Prepared:
     mesh: TileMesh
 
 
-class NumbaRenderer(TileRenderer):
+class NumbaRenderer(MapRenderer):
     """Draws the tiles of a streamer on the CPU. One thread renders at a time."""
 
     def __init__(self, streamer: TileProvider, threads: int = 2) -> None:
@@ -64,7 +64,7 @@ class NumbaRenderer(TileRenderer):
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """See `TileRenderer.draw`."""
+        """See `MapRenderer.draw`."""
         meshes = _front_to_back([m for m in meshes if len(m.faces)], world_from_camera)
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.float32)
@@ -91,7 +91,7 @@ class NumbaRenderer(TileRenderer):
         return RenderedView(rgb, depth, world_from_camera, camera)
 
     def close(self) -> None:
-        """See `TileRenderer.close`."""
+        """See `MapRenderer.close`."""
         if self._pool is not None:
             self._pool.shutdown()
 

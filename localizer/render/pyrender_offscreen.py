@@ -30,7 +30,7 @@ from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import TileMesh
-from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
+from localizer.render.base import SKY, MapRenderer, TileProvider, clip_from_camera
 from localizer.types import RenderedView
 
 # PyOpenGL 3.1.0, which pyrender asks for, does not know what Python 3.12 calls references.
@@ -80,7 +80,7 @@ void main() {
 }"""
 
 
-class PyrenderRenderer(TileRenderer):
+class PyrenderRenderer(MapRenderer):
     """Draws tiles with pyrender. Only the thread that made it may use it."""
 
     def __init__(self, streamer: TileProvider) -> None:

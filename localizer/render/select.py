@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, TypeVar
+from typing import Literal
 
 from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
@@ -16,7 +16,6 @@ from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import RenderedView
 
 RendererName = Literal["auto", "numba", "moderngl", "pyrender"]
-T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -80,39 +79,22 @@ def make_renderer(
     return NumbaRenderer(streamer, threads)
 
 
-class _OwnedRenderer:
+class _OwnedRenderer(MapRenderer):
     """A renderer on its own thread; callers wait for that thread."""
 
     def __init__(self, renderer: MapRenderer, owner: ThreadPoolExecutor) -> None:
+        super().__init__(renderer.streamer)
         self.name = renderer.name
         self._renderer = renderer
         self._owner = owner
 
-    def render(
-        self,
-        world_from_camera: Pose,
-        camera: Camera,
-        extra: Sequence[TileMesh] = (),
-        *,
-        wait: bool = False,
+    def draw(
+        self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
     ) -> RenderedView:
-        """See `MapRenderer.render`."""
-        return self._call(
-            lambda: self._renderer.render(world_from_camera, camera, extra, wait=wait)
-        )
-
-    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
-        """See `MapRenderer.prefetch`: touches no OpenGL."""
-        self._renderer.prefetch(views, camera)
-
-    def warm_up(self) -> None:
-        """See `MapRenderer.warm_up`."""
-        self._call(self._renderer.warm_up)
+        """See `MapRenderer.draw`."""
+        return self._owner.submit(self._renderer.draw, meshes, world_from_camera, camera).result()
 
     def close(self) -> None:
         """Release the context on its thread, and end the thread."""
-        self._call(self._renderer.close)
+        self._owner.submit(self._renderer.close).result()
         self._owner.shutdown()
-
-    def _call(self, function: Callable[[], T]) -> T:
-        return self._owner.submit(function).result()

@@ -21,7 +21,7 @@ TERRAIN_SPACING_M = 5.0
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """A world's geometry. relief_m, town_radius_m: None: derived from size and seed.
+    """A world's geometry. relief_m: None: derived from size and seed.
 
     character: use of nearly all cells; mixed: a town surrounded by open country.
     """
@@ -29,7 +29,6 @@ class WorldConfig:
     seed: int
     size_m: float = 1600.0
     relief_m: float | None = None
-    town_radius_m: float | None = None
     geoid_separation_m: float = 47.5
     character: Character = "mixed"
 

@@ -23,8 +23,14 @@ from localizer.synth.config import BLOCK_M, TOP_M, Variant, WorldConfig, look_of
 from localizer.synth.plan.layout import plan_world
 from localizer.synth.plan.plan import PlannedTarget, WorldPlan
 from localizer.synth.plan.terrain import River, Terrain
-from localizer.synth.tiles.bake import Baker, TilePart, bake_block, start_worker
-from localizer.synth.tiles.coarse import assemble_root, assemble_top
+from localizer.synth.tiles.bake import (
+    Baker,
+    TilePart,
+    assemble_root,
+    assemble_top,
+    bake_block,
+    start_worker,
+)
 from localizer.synth.tiles.scene import TileScene, make_scene
 from localizer.synth.tiles.write import write_tileset
 from localizer.synth.visits.visit import Visit

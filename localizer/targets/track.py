@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from localizer.geometry.pose import Array
-from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import (
     LastPosition,
@@ -31,6 +30,23 @@ from localizer.targets.locate import (
 )
 from localizer.targets.static import ObservedRay, StaticTarget
 from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
+
+
+@dataclass(frozen=True)
+class SharedBias:
+    """Sigmas of the common error: metres along each axis, and radians as seen from the camera."""
+
+    sigma_m: float = 0.2
+    sigma_rad: float = 0.0005
+
+    def covariance(self, offset: Array) -> Array:
+        """(3, 3) m², world axes, of a target at `offset` (3,) from the camera."""
+        distance = float(np.linalg.norm(offset))
+        d = offset / max(distance, 1e-6)
+        across = np.eye(3) - np.outer(d, d)
+        shared: Array = self.sigma_m**2 * np.eye(3) + (self.sigma_rad * distance) ** 2 * across
+        return shared
+
 
 _STANDS_S = 2.0  # for so long it must agree with standing before it stands again
 _STANDS_MPS = 1.0

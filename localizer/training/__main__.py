@@ -16,7 +16,7 @@ from localizer.errors import LocalizerError
 
 try:
     from localizer.training.config import LiveSection, TrainConfig, load_config
-    from localizer.training.data.seeds import FIRST_WORLD_SEED
+    from localizer.training.data.pairs import FIRST_WORLD_SEED
     from localizer.training.data.shards import write_shards, write_world_shards
 except ModuleNotFoundError as error:
     if error.name != "torch":
@@ -90,9 +90,7 @@ def _generate(config: TrainConfig) -> None:
     data = config.data
     if isinstance(data, LiveSection):
         return  # it makes its pairs while it trains
-    from localizer.training.data.streams import photo_source, scene_config
-
-    photos, scenes = photo_source(data), scene_config(data)
+    photos, scenes = data.library(), data.scene_config()
     first = range(data.first_seed, data.first_seed + min(data.initial_scenes, data.scenes))
     rest = range(first.stop, data.first_seed + data.scenes)
     worlds = range(FIRST_WORLD_SEED, FIRST_WORLD_SEED + data.worlds)

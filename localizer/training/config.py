@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,7 +21,9 @@ from localizer.errors import ModelError
 from localizer.plain_files import plain_text
 from localizer.strict_yaml import load_yaml, misread_booleans
 from localizer.synth.heightfield.scene import BLOCK
+from localizer.training.data.pairs import SceneConfig
 from localizer.training.models.networks import NetworkConfig
+from localizer.training.places.photos import PhotoLibrary
 
 _MOST_WORKERS = 1024  # processes or threads
 _MOST_STEPS = 10**9
@@ -43,9 +46,17 @@ class _PlacesSection(_Frozen):
     photos: Path | None
     photo_groups: tuple[str, ...]
     photo_share: float = Field(ge=0.0, le=1.0)
-    light_variety: bool
-    appearance: bool
     workers: int = Field(gt=0, le=_MOST_WORKERS)
+    image: tuple[_Side, _Side]
+
+    def scene_config(self) -> SceneConfig:
+        """Scene configuration of the run."""
+        width, height = self.image
+        return SceneConfig(photo_share=self.photo_share, width=width, height=height)
+
+    def library(self) -> PhotoLibrary | None:
+        """The real textures of the run; None if it uses none."""
+        return None if self.photos is None else PhotoLibrary(self.photos, self.photo_groups)
 
 
 class DataSection(_PlacesSection):
@@ -69,11 +80,14 @@ class LiveSection(_PlacesSection):
     """
 
     live: Literal[True]
-    image: tuple[_Side, _Side]
     cells: int = Field(gt=0, le=16384, multiple_of=BLOCK)
     active: int = Field(gt=0)
     steps_per_scene: int = Field(gt=0, le=_MOST_STEPS)
     flight_days: int = Field(gt=0, le=1000)
+
+    def scene_config(self) -> SceneConfig:
+        """See `_PlacesSection.scene_config`."""
+        return replace(super().scene_config(), cells=self.cells)
 
     @model_validator(mode="after")
     def _places_suffice(self) -> LiveSection:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.look_at import LOOKS, LookAt
-from mavlink_bridge.camera.marks import Marks
 from mavlink_bridge.camera.messages import (
     camera_fov_status,
     camera_information,
@@ -25,6 +24,7 @@ from mavlink_bridge.camera.messages import (
 from mavlink_bridge.camera.targets import (
     adsb_vehicle,
     image_captured,
+    is_confirmed,
     tracking_geo_status,
     tracking_image_status,
 )
@@ -53,6 +53,8 @@ _OLD_REQUESTS = {
 }
 _MOST_CLICKS, _CLICKS_NS = 10, 5_000_000_000  # no hand is faster
 _MIN_INTERVAL_US = 20_000
+_MARK_AGAIN_NS = 2_000_000_000  # a mark is said three times: it may be lost, and no one asks again
+_MOST_MARKS = 256  # remembered of targets that are gone, so that none is marked twice
 _PER_TICK = 4  # targets: more in one go would fill a slow port, and positions wait behind them
 
 
@@ -69,6 +71,48 @@ class _ClickRate:
             return True
         times.append(time_ns)
         return False
+
+
+@dataclass
+class TargetMark:
+    """Position of a confirmed target. left: number of times it is still to be sent."""
+
+    report: TargetReport
+    index: int
+    left: int = 3
+    sent_ns: int = -_MARK_AGAIN_NS
+
+
+class Marks:
+    """Selects the next marker to send. Of ended targets only the newest 256 are kept, because a
+    detector may name any number of targets.
+    """
+
+    def __init__(self, sigma_m: float) -> None:
+        self._sigma_m = sigma_m
+        self._marks: dict[int, TargetMark] = {}
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self._marks)
+
+    def due(self, targets: Mapping[int, TargetReport], now_ns: int) -> TargetMark | None:
+        """The target marker to send at now_ns, or None; the marker counts as sent. A marker is made
+        once a target's sigma is small enough, and is sent three times. At most one is returned, so
+        that a slow port still carries the positions.
+        """
+        for number, report in targets.items():
+            if number not in self._marks and is_confirmed(report, self._sigma_m):
+                self._marks[number] = TargetMark(report, self._next)
+                self._next += 1
+        gone = [number for number in self._marks if number not in targets]
+        for number in gone[: max(0, len(self._marks) - _MOST_MARKS)]:
+            del self._marks[number]
+        for mark in self._marks.values():
+            if mark.left and now_ns - mark.sent_ns >= _MARK_AGAIN_NS:
+                mark.left, mark.sent_ns = mark.left - 1, now_ns
+                return mark
+        return None
 
 
 class CameraComponent:
@@ -104,11 +148,6 @@ class CameraComponent:
         self._view_sent_ns = 0
         self._idle_ns = 0
         self._idle_left = _IDLE_TIMES
-
-    @property
-    def targets(self) -> int:
-        """Number of reported targets."""
-        return len(self._targets)
 
     def report(self, target: TargetReport) -> None:
         """Set the newest fix of a target, to be sent by `tick`."""

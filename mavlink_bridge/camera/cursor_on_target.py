@@ -79,10 +79,8 @@ class CursorOnTarget:
 
 def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc) -> bytes:
     """A target's event (XML); hae is the ellipsoidal height."""
-    seen = _moment(report.time_ns, utc)
-    stale = seen + timedelta(seconds=config.cot_stale_s)
-    event = _event(f"pilot-target-{report.target_id}", _TARGET_TYPE, seen, stale)
-    _point(event, report)
+    uid = f"pilot-target-{report.target_id}"
+    event = _event(uid, _TARGET_TYPE, report, utc, config.cot_stale_s)
     detail = ElementTree.SubElement(event, "detail")
     ElementTree.SubElement(detail, "contact", callsign=f"TGT{report.target_id:04d}")
     if report.elsewhere >= _TOLD_ELSEWHERE:
@@ -105,10 +103,8 @@ def aircraft_on_map(
     The range of the field of view is the horizontal distance to the image's centre, so that it ends
     there on the map. A camera that looks into the sky has no range.
     """
-    seen = _moment(view.time_ns, utc)
-    stale = seen + timedelta(seconds=_AIRCRAFT_STALE_S)
-    event = _event(f"pilot-aircraft-{config.cot_callsign}", _AIRCRAFT_TYPE, seen, stale)
-    _point(event, view)
+    uid = f"pilot-aircraft-{config.cot_callsign}"
+    event = _event(uid, _AIRCRAFT_TYPE, view, utc, _AIRCRAFT_STALE_S)
     detail = ElementTree.SubElement(event, "detail")
     ElementTree.SubElement(detail, "contact", callsign=config.cot_callsign)
     azimuth_deg, elevation_deg, roll_deg = sensor_angles(view.quaternion_ned)
@@ -152,8 +148,11 @@ def sensor_angles(quaternion_ned: quat.Quaternion) -> tuple[float, float, float]
     return math.degrees(azimuth), math.degrees(elevation), math.degrees(roll)
 
 
-def _event(uid: str, kind: str, seen: datetime, stale: datetime) -> ElementTree.Element:
-    return ElementTree.Element(
+def _event(
+    uid: str, kind: str, place: TargetReport | CameraView, utc: SteadyUtc, stale_s: float
+) -> ElementTree.Element:
+    seen = datetime.fromtimestamp(utc.utc_ns(place.time_ns) * 1e-9, tz=timezone.utc)
+    event = ElementTree.Element(
         "event",
         version="2.0",
         uid=uid,
@@ -161,11 +160,8 @@ def _event(uid: str, kind: str, seen: datetime, stale: datetime) -> ElementTree.
         how=_MEASURED,
         time=_stamp(seen),
         start=_stamp(seen),
-        stale=_stamp(stale),
+        stale=_stamp(seen + timedelta(seconds=stale_s)),
     )
-
-
-def _point(event: ElementTree.Element, place: TargetReport | CameraView) -> None:
     ElementTree.SubElement(
         event,
         "point",
@@ -175,10 +171,7 @@ def _point(event: ElementTree.Element, place: TargetReport | CameraView) -> None
         ce=_accuracy(place.h_accuracy_m),
         le=_accuracy(place.v_accuracy_m),
     )
-
-
-def _moment(time_ns: int, utc: SteadyUtc) -> datetime:
-    return datetime.fromtimestamp(utc.utc_ns(time_ns) * 1e-9, tz=timezone.utc)
+    return event
 
 
 def _stamp(moment: datetime) -> str:

@@ -21,7 +21,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import CommandAnswer, LookAtRefusal
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
-from mavlink_bridge.place_hint import GLOBAL_FRAMES
+from mavlink_bridge.place_hint import place_of
 from mavlink_bridge.vehicle.origin import north_east
 
 LOOK_AT_PLACE = mavlink.MAV_CMD_DO_SET_ROI_LOCATION
@@ -171,13 +171,7 @@ class LookAt:
 
 def _place(message: Any) -> _Place | None:
     """Position of a MAV_CMD_DO_SET_ROI_LOCATION; None if it has none."""
-    if message.get_type() == "COMMAND_INT":
-        latitude, longitude, altitude = message.x * 1e-7, message.y * 1e-7, message.z
-        frame = int(message.frame)
-    else:
-        latitude, longitude, altitude = message.param5, message.param6, message.param7
-        frame = int(mavlink.MAV_FRAME_GLOBAL)
-    is_place = abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(altitude) < 2e4
-    if frame not in GLOBAL_FRAMES or not is_place or (latitude == 0.0 and longitude == 0.0):
+    place = place_of(message)
+    if place is None or not abs(place[2]) < 2e4:
         return None
-    return _Place(latitude, longitude, altitude, frame)
+    return _Place(*place, int(getattr(message, "frame", mavlink.MAV_FRAME_GLOBAL)))

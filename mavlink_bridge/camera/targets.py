@@ -21,26 +21,19 @@ _ADSB_FLAGS = (
     | mavlink.ADSB_FLAGS_VALID_ALTITUDE
     | mavlink.ADSB_FLAGS_VALID_CALLSIGN
 )
+_IDLE = int(mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE)
 _ELSEWHERE = 0.05  # a target more likely on another surface than this is not confirmed
 _ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's number
 
 
 def tracking_image_status(report: TargetReport | None) -> Any:
     """CAMERA_TRACKING_IMAGE_STATUS (275): its rectangle or point; None or without both: idle."""
-    if report is None or (report.pixel is None and report.rectangle is None):
-        active, mode = mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE, 0
-        point, rectangle = (NAN, NAN), (NAN,) * 4
-    elif report.rectangle is not None:
-        active = _status(report)
-        mode, point, rectangle = (
-            mavlink.CAMERA_TRACKING_MODE_RECTANGLE,
-            (NAN, NAN),
-            report.rectangle,
-        )
-    else:
-        active = _status(report)
-        mode, rectangle = mavlink.CAMERA_TRACKING_MODE_POINT, (NAN,) * 4
-        point = report.pixel or (NAN, NAN)
+    point, rectangle, mode = (NAN, NAN), (NAN,) * 4, mavlink.CAMERA_TRACKING_MODE_NONE
+    if report is not None and report.rectangle is not None:
+        rectangle, mode = report.rectangle, mavlink.CAMERA_TRACKING_MODE_RECTANGLE
+    elif report is not None and report.pixel is not None:
+        point, mode = report.pixel, mavlink.CAMERA_TRACKING_MODE_POINT
+    active = _status(report) if report is not None and mode else _IDLE
     return mavlink.MAVLink_camera_tracking_image_status_message(
         active,
         mode,

@@ -107,14 +107,6 @@ class ClosedLoopCheck:
             self.jumping, self._repeats = False, 0  # another jump may be missed as often
         return LoopVerdict(reason is None, reason, difference)
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of entries in each queue, by name."""
-        return {
-            "sent": len(self._sent),
-            "pending": len(self._pending),
-            "differences": len(self._differences),
-        }
-
     def is_jump_missed(self) -> bool:
         """Whether an announced jump must be announced again, because the EKF did not follow: True
         once for each announcement, up to five times.

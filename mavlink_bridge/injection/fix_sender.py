@@ -194,10 +194,6 @@ class FixSender:
         is_told = reported is not None and reported.id is not AlertId.INJECTING
         return self._reason if is_told else None
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of entries in each queue, by name."""
-        return {"fixes": len(self._fixes), "due": self.injector.waiting}
-
     def _deliver(
         self, link: Link, state: VehicleState, mode: Mode, injection: EncodedMessage, now_ns: int
     ) -> None:

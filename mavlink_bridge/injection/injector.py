@@ -137,7 +137,8 @@ class Injector:
         self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
         self.latency = Latency()
         self._fresh: VisionFix | None = None
-        self._reset_counter = 0
+        self.reset_counter = 0
+        """The reset counter of the last message."""
         self._announced = 0
         self._sent_jumps = 0  # of the localizer and announced, as the last message had them
         self._newest_ns = 0
@@ -152,16 +153,6 @@ class Injector:
         self.reason: Alert | None = alert(AlertId.NO_FIX_YET)
         """Why nothing was sent last; None when it was."""
         self.counters: Counter[str] = Counter()
-
-    @property
-    def reset_counter(self) -> int:
-        """The reset counter of the last message."""
-        return self._reset_counter
-
-    @property
-    def waiting(self) -> int:
-        """Number of fixes that have not reached the age `delay_ms`."""
-        return len(self._waiting)
 
     @property
     def refused_yaw_rad(self) -> float | None:
@@ -307,7 +298,7 @@ class Injector:
             over = alert(AlertId.SIGMA_OVER_LIMIT, metres=sigma)
             return HeldOutput(over, "withheld_covariance")
         jumps = fix.reset_count + self._announced
-        counter = (self._reset_counter + (jumps != self._sent_jumps)) % 256
+        counter = (self.reset_counter + (jumps != self._sent_jumps)) % 256
         estimate = EncodedEstimate(
             position,
             vision_attitude(fix, time_ns, context),
@@ -320,6 +311,6 @@ class Injector:
         )
         outcome = self._encoder.make(estimate, now_ns, context)
         if isinstance(outcome, EncodedMessage):
-            self._reset_counter, self._sent_jumps = counter, jumps
+            self.reset_counter, self._sent_jumps = counter, jumps
             self._sent_fix_ns = fix.time_ns
         return outcome

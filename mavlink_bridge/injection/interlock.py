@@ -12,7 +12,7 @@ from collections.abc import Callable
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import CATALOGUE, alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.config import Mode
+from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore, gnss_healthy
 from mavlink_bridge.messages import VehicleState
@@ -27,20 +27,22 @@ _GO_NS = 600_000_000_000
 class ShadowInterlock:
     """Decides at each step whether fixes may be injected; one thread.
 
-    force: `bridge.injection.force`. score: gives the result of the shadow check at a time.
-    compared_ns: when a fix was last compared with GNSS, 0 if never. memory: keeps a failed shadow
-    check over a restart. inhibited_by: active alerts that inhibit injection.
+    score: gives the result of the shadow check at a time. compared_ns: when a fix was last compared
+    with GNSS, 0 if never. inhibited_by: active alerts that inhibit injection. A failed shadow check
+    is kept over a restart, beside `state_file`.
     """
 
     def __init__(
         self,
-        force: bool,
+        config: BridgeConfig,
         score: Callable[[int], ShadowScore],
         compared_ns: Callable[[], int],
         notifier: StatusNotifier,
-        memory: ShadowFailureMemory | None = None,
     ) -> None:
-        self._force, self._memory = force, memory
+        self._force, file = config.injection.force, config.state_file
+        self._memory: ShadowFailureMemory | None = None
+        if file is not None:
+            self._memory = ShadowFailureMemory(file.with_name("shadow-no-go.json"))
         self._score = score
         self._compared_ns = compared_ns
         self._notifier = notifier
@@ -52,8 +54,15 @@ class ShadowInterlock:
         self._reason: Alert | None = alert(AlertId.SHADOW_NOT_COMPARED)
         self._open = False
 
+    def set_map_id(self, map_id: str) -> None:
+        """Set the id of the map; called before `recall`."""
+        if self._memory is not None:
+            self._memory.about = map_id
+
     def recall(self) -> None:
-        """Restore the failed shadow check of a process that was killed, and report it."""
+        """Restore the failed shadow check of a process that was killed, and report it; before the
+        link starts.
+        """
         if self._memory is not None and self._memory.recall():
             self._against = self._reason = alert(AlertId.SHADOW_RESTORED)
             self._notifier.report(self._against)

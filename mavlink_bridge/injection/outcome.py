@@ -104,10 +104,6 @@ class InjectionOutcome:
         self._notifier.report(alert(AlertId.JUMP_REPEATED))
         return True
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of entries in each queue, by name."""
-        return {"to compare": len(self._to_compare), **self._loop.queue_lengths()}
-
 
 def _by_receiver(
     state: VehicleState, fix: PropagatedFix, altitude_m: float

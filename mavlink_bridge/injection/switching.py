@@ -132,75 +132,105 @@ def gnss_fault(
 
 
 class SourceSwitch:
-    """Decides about the EKF's source set; the caller sends the command and reports the
-    acknowledgement. One thread.
+    """Decides about the EKF's source set, orders it and reports that; one thread.
 
-    refusal: why the vision set is not selected although GNSS is bad; else None. current: the set in
-    use, None if unknown. returning: the check of GNSS while it is not used.
+    current: the source set of the flight controller, by its acknowledgements and texts; the GNSS
+    set until then (PX4, which has no sets: always); None if unknown.
     """
 
-    def __init__(self, config: SourceSwitchConfig) -> None:
+    def __init__(
+        self,
+        config: SourceSwitchConfig,
+        commander: Commander,
+        notifier: StatusNotifier,
+        counters: Counter[str],
+    ) -> None:
         self._config = config
+        self._commander = commander
+        self._notifier = notifier
+        self._counters = counters
         self.current: int | None = config.gnss_set
-        self.refusal: Alert | None = None
-        self.returning = GnssReturnCheck()
+        self._returning = GnssReturnCheck()
         self._bad_since_ns: int | None = None
         self._sound_since_ns: int | None = None
         self._vision_ns: int | None = None
         self._ordered: int | None = None
-        self._was_chosen = self._overruled = False
+        self._was_chosen = self._overruled = self._has_met = False
         self._next_ns = 0
+        self._refused_ns: int | None = None  # when it was reported that GNSS is refused
+        self._held_ns = 0  # when it was reported that the set is kept
 
-    def reset(self) -> None:
-        """Assume the GNSS set, because the flight controller rebooted and uses its first set."""
+    @property
+    def on_gnss(self) -> bool:
+        """Whether the flight controller is known to use the GNSS set."""
+        return self.current == self._config.gnss_set
+
+    @property
+    def gnss_refused(self) -> bool:
+        """Whether a receiver with a fix is not used because it contradicts vision."""
+        return self._returning.refusal is not None
+
+    def on_first_message(self, state: VehicleState) -> None:
+        """Process the vehicle's state at its first message; further calls do nothing. The set of an
+        ArduPilot that is armed already is unknown, because this process may have been restarted,
+        which is reported; a disarmed one uses its first.
+        """
+        if not self._has_met and state.armed and state.autopilot == "ardupilot":
+            self.current = None
+            self._notifier.report(alert(AlertId.SOURCE_SET_UNKNOWN))
+        self._has_met = True
+
+    def on_text(self, text: str) -> None:
+        """Process a STATUSTEXT of the autopilot, which may name the source set in use. A set that
+        we did not order is the pilot's choice. A chosen vision set stays; a chosen GNSS set stays
+        until the present fault of GNSS ends.
+        """
+        told = _CHOSEN.match(text)
+        if told is None or int(told[1]) in (self.current, self._ordered):
+            return
+        self.current, self._was_chosen = int(told[1]), True
+        self._overruled = self._bad_since_ns is not None
+
+    def rebooted(self) -> None:
+        """Assume the GNSS set, because the flight controller rebooted and uses its first."""
         self.current, self._ordered = self._config.gnss_set, None
         self._bad_since_ns = self._sound_since_ns = None
         self._was_chosen = self._overruled = False
+        self._notifier.forget("switch")
 
-    def on_armed_contact(self) -> None:
-        """Mark the set as unknown, because the vehicle was armed at the first heartbeat."""
-        self.current = None
-
-    def on_reported_set(self, source_set: int) -> None:
-        """Process the autopilot's report of the set in use. A set that we did not order is the
-        pilot's choice. A chosen vision set stays; a chosen GNSS set stays until the present fault
-        of GNSS ends.
-        """
-        if source_set in (self.current, self._ordered):
+    def acknowledged(self, accepted: bool) -> None:
+        """Process a COMMAND_ACK of an order (accepted or not); a refusal is reported."""
+        ordered, self._ordered = self._ordered, None
+        if ordered is None:
             return
-        self.current, self._was_chosen = source_set, True
-        self._overruled = self._bad_since_ns is not None
-
-    def acknowledged(self, accepted: bool) -> bool:
-        """Process a COMMAND_ACK (accepted or not); returns whether it answers an order."""
-        if self._ordered is None:
-            return False
         if accepted:
-            self.current, self._was_chosen = self._ordered, False
-        self._ordered = None
-        return True
+            self.current, self._was_chosen = ordered, False
+        else:
+            self._notifier.report(alert(AlertId.SOURCE_SET_REFUSED))
 
-    def decide(
+    def tick(
         self,
-        now_ns: int,
+        link: Link,
         state: VehicleState,
         vision: PropagatedFix | None,
         *,
         good: bool,
         may_switch: bool,
-    ) -> SwitchOrder | None:
-        """The order to send at now_ns, or None. vision: last position, None if none. good:
-        positions are being sent and pass the yaw guard. may_switch: the shadow check of this flight
-        has passed.
+        now_ns: int,
+    ) -> None:
+        """Send and report an order if one is due, and report why none is sent although GNSS is bad,
+        and a receiver that contradicts vision. vision: last position, None if none. good: positions
+        are being sent and pass the yaw guard. may_switch: the shadow check of this flight has
+        passed.
         """
-        self.refusal = None
         fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
-        if self.current == self._config.gnss_set:
-            self.returning.reset()
+        if self.on_gnss:
+            self._returning.reset()
         else:
-            self.returning.update(state, vision if fresh and good else None, now_ns)
+            self._returning.update(state, vision if fresh and good else None, now_ns)
+        self._report_refused(now_ns)
         if not self._config.enabled:
-            return None
+            return
         fault = gnss_fault(
             state, vision if fresh else None, self._config.inconsistency_sigmas, now_ns
         )
@@ -212,14 +242,16 @@ class SourceSwitch:
         if self._vision_ns is None or (fresh and good):
             self._vision_ns = now_ns
         if now_ns < self._next_ns:
-            return None
+            return
         order = self._to_vision(now_ns, fault, fresh and good, may_switch) or self._to_gnss(
             now_ns, state, fault
         )
         if order is not None:
             self._next_ns = now_ns + _RETRY_NS
             self._ordered = order.source_set
-        return order
+            self._counters["source_switches"] += 1
+            self._commander.send(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
+            self._notifier.notify("switch", order.alert)
 
     def _to_vision(
         self, now_ns: int, fault: GnssFault | None, vision_good: bool, may_switch: bool
@@ -238,8 +270,10 @@ class SourceSwitch:
             why = SwitchRefusal.NOT_READY
         elif vision_good:
             return SwitchOrder(self._config.vision_set, fault.cause, fault.metres)
-        if why is not None:
-            self.refusal = Alert(AlertId.SOURCE_SET_HELD, (fault.cause, fault.metres, why))
+        if why is not None and now_ns - self._held_ns >= _AGAIN_NS:
+            self._held_ns = now_ns  # again as long as it lasts: the operator decides
+            values = (fault.cause, fault.metres, why)
+            self._notifier.report(Alert(AlertId.SOURCE_SET_HELD, values))
         return None
 
     def _to_gnss(
@@ -247,7 +281,7 @@ class SourceSwitch:
     ) -> SwitchOrder | None:
         if self.current not in (self._config.vision_set, None) or self._was_chosen:
             return None
-        agrees = self.returning.accepted and fault is None
+        agrees = self._returning.accepted and fault is None
         if agrees and self._config.return_to_gnss and self.current is not None:
             return SwitchOrder(self._config.gnss_set, ReturnCause.GNSS_GOOD)
         if self._vision_ns is None or now_ns - self._vision_ns < _VISION_GONE_NS:
@@ -258,109 +292,19 @@ class SourceSwitch:
         # Without any position the vehicle lands after 8 s. A receiver that is not where the EKF
         # went by itself, or not where vision was while it could be asked, may be a wrong one.
         receiver, ekf = _receiver(state), _ekf(state)
-        refused = self.returning.refusal is not None
+        refused = self._returning.refusal is not None
         if refused or receiver is None or ekf is None or _distance_m(receiver, ekf) > _RETURN_M:
             return None
         return SwitchOrder(self._config.gnss_set, ReturnCause.VISION_LOST)
 
-
-class SourceOrders:
-    """Sends the orders of `SourceSwitch` and reports them; one thread."""
-
-    def __init__(
-        self,
-        config: SourceSwitchConfig,
-        commander: Commander,
-        notifier: StatusNotifier,
-        counters: Counter[str],
-    ) -> None:
-        self._switch = SourceSwitch(config)
-        self._alerted_ns: int | None = None
-        self._gnss_set = config.gnss_set
-        self._commander = commander
-        self._notifier = notifier
-        self._counters = counters
-        self._refused_ns: int | None = None
-        self._has_met = False
-
-    @property
-    def current(self) -> int | None:
-        """The source set of the flight controller, by its acknowledgements and texts; the GNSS set
-        until then (PX4, which has no sets: always); None if unknown.
-        """
-        return self._switch.current
-
-    @property
-    def on_gnss(self) -> bool:
-        """Whether the flight controller is known to use the GNSS set."""
-        return self.current == self._gnss_set
-
-    @property
-    def gnss_refused(self) -> bool:
-        """Whether a receiver with a fix is not used because it contradicts vision."""
-        return self._switch.returning.refusal is not None
-
-    def on_first_message(self, state: VehicleState) -> None:
-        """Process the vehicle's state at its first message; further calls do nothing. The set of an
-        ArduPilot that is armed already is unknown, because this process may have been restarted,
-        which is reported; a disarmed one uses its first.
-        """
-        if self._has_met:
-            return
-        self._has_met = True
-        if state.armed and state.autopilot == "ardupilot":
-            self._switch.on_armed_contact()
-            self._notifier.report(alert(AlertId.SOURCE_SET_UNKNOWN))
-
-    def on_text(self, text: str) -> None:
-        """Process a STATUSTEXT of the autopilot, which may name the source set in use."""
-        told = _CHOSEN.match(text)
-        if told is not None:
-            self._switch.on_reported_set(int(told[1]))
-
-    def rebooted(self) -> None:
-        """Assume the GNSS set, because the flight controller rebooted and uses its first."""
-        self._switch.reset()
-        self._notifier.forget("switch")
-
-    def acknowledged(self, accepted: bool) -> None:
-        """Process a COMMAND_ACK of an order (accepted or not); a refusal is reported."""
-        if self._switch.acknowledged(accepted) and not accepted:
-            self._notifier.report(alert(AlertId.SOURCE_SET_REFUSED))
-
-    def tick(
-        self,
-        link: Link,
-        state: VehicleState,
-        vision: PropagatedFix | None,
-        *,
-        good: bool,
-        may_switch: bool,
-        now_ns: int,
-    ) -> None:
-        """Send and report an order if one is due, and report why none is sent although GNSS is bad,
-        and a receiver that contradicts vision. Parameters: as `SourceSwitch.decide`.
-        """
-        order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
-        self._report_refused(now_ns)
-        refusal = self._switch.refusal
-        if refusal is not None and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
-            self._refused_ns = now_ns  # again as long as it lasts: the operator decides
-            self._notifier.report(refusal)
-        if order is None:
-            return
-        self._counters["source_switches"] += 1
-        self._commander.send(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
-        self._notifier.notify("switch", order.alert)
-
     def _report_refused(self, now_ns: int) -> None:
-        returning, alerted_ns = self._switch.returning, self._alerted_ns
+        returning, alerted_ns = self._returning, self._refused_ns
         again_ns = spec_of(AlertId.GNSS_REFUSED).repeat_s * 1e9
         if returning.refusal is not None:
             if alerted_ns is None or now_ns - alerted_ns >= again_ns:
-                self._alerted_ns, why = now_ns, returning.refusal
+                self._refused_ns, why = now_ns, returning.refusal
                 self._notifier.report(alert(AlertId.GNSS_REFUSED, size=why.size, why=why.why))
         elif alerted_ns is not None:
-            self._alerted_ns = None
+            self._refused_ns = None
             if returning.accepted:
                 self._notifier.report(cleared(AlertId.GNSS_REFUSED))

@@ -43,7 +43,6 @@ class YawGuard:
 
     It blocks if the majority of five fixes fail, because noise lets some fixes of a
     rotated frame pass. It releases after as many good fixes in a row, tested with a smaller limit.
-    unchecked: number of fixes without a yaw to compare.
     """
 
     def __init__(self) -> None:
@@ -52,7 +51,6 @@ class YawGuard:
         self._last: deque[bool] = deque(maxlen=_MINIMUM_SAMPLES)
         self._reset_count = 0  # of the fix before
         self.blocked = False
-        self.unchecked = 0
         self._unchecked_in_a_row = 0
 
     @property
@@ -68,13 +66,12 @@ class YawGuard:
 
     def check(self, fix: VisionFix, autopilot: Attitude | None) -> YawVerdict:
         """Check one fix, in order of time. autopilot: its attitude at that time, None if unknown. A
-        fix without both yaws passes unless the guard blocks, and counts as `unchecked`.
+        fix without both yaws passes unless the guard blocks.
         """
         time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad
         reset = fix.reset_count != self._reset_count
         self._reset_count = fix.reset_count
         if autopilot is None or vision_yaw_rad is None:
-            self.unchecked += 1
             self._unchecked_in_a_row += 1
             return YawVerdict(not self.blocked, None)
         self._unchecked_in_a_row = 0

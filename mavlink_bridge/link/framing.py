@@ -114,16 +114,6 @@ class FrameReader:
         self._buffer.clear()
         self._sequences.clear()
 
-    @property
-    def waiting(self) -> int:
-        """Bytes of incomplete frames."""
-        return len(self._buffer)
-
-    @property
-    def sources(self) -> int:
-        """Number of (system, component) pairs whose sequence numbers are tracked."""
-        return len(self._sequences)
-
     def feed(self, data: bytes, raw: deque[bytes] | None = None) -> list[Any]:
         """The wanted messages that `data` completes, without those that fail signing. All frames of
         right checksum, these too, are appended to `raw`.

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.config import SigningConfig
 from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.link import signing
 from mavlink_bridge.link.clock import monotonic_ns, utc_us
@@ -74,8 +75,9 @@ class LinkOptions:
     """Settings of a link besides its endpoint. name: of thread and counters. wanted: ids of
     messages to decode, None: all. opener: opens the transport. recorder: records all frames.
 
-    signing_key: 32 bytes, None without signing; window: the newest timestamps of signed messages,
-    which survive a restart. timeout_s: silence after which a stream (TCP, serial) is reopened.
+    signing: None without; its key is read when the link is made (`SigningKeyError`). remembers: the
+    newest timestamps of signed messages survive a restart, in a file. timeout_s: silence after
+    which a stream (TCP, serial) is reopened.
 
     sender: of UDP, the only host that is accepted. follow_hosts_after_s: of UDP, silence after
     which another host is accepted. stop: ends the owner thread when it is set.
@@ -83,15 +85,14 @@ class LinkOptions:
 
     name: str = "link"
     wanted: Collection[int] | None = None
-    signing_key: bytes | None = None
-    signing_link_id: int = 1
+    signing: SigningConfig | None = None
     recorder: TlogRecorder | None = None
     timeout_s: float = 5.0
     opener: Callable[[Endpoint], Transport] = open_transport
     stop: threading.Event | None = None
     sender: tuple[str, int | None] | None = None
     follow_hosts_after_s: float | None = None
-    window: ReplayWindow | None = None
+    remembers: bool = False
 
 
 class Link:
@@ -110,13 +111,15 @@ class Link:
         self.counters = LinkCounters()
         self.system_id = 0
         self._handler = handler
-        self._reader = FrameReader(o.wanted, o.signing_key, o.window)
-        self._window = o.window
-        self._only, self._follow_hosts_after_s = o.sender, o.follow_hosts_after_s
-        self._key, self._key_link = o.signing_key, o.signing_link_id
+        self._options = o
+        self._key: bytes | None = None
+        self._window: ReplayWindow | None = None
+        if o.signing is not None:
+            self._key = signing.load_key(o.signing.key_file)
+            if o.remembers:
+                self._window = ReplayWindow(o.signing.state_path(o.name))
+        self._reader = FrameReader(o.wanted, self._key, self._window)
         self._recorder = o.recorder
-        self._timeout_ns = int(o.timeout_s * 1e9)
-        self._open = o.opener
         self._packers: dict[int, Any] = {}
         self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
         self._unsent = bytearray()
@@ -173,7 +176,7 @@ class Link:
 
     def stop(self) -> None:
         """Stop the owner thread, wait for it (5 s at most), and close the transport and the
-        options' `window`. Harmless when called again.
+        file of timestamps. Harmless when called again.
         """
         self._stop.set()
         self.wake()
@@ -210,14 +213,6 @@ class Link:
         mine = {**asdict(self.counters), "rx_of_strangers": refused}
         return {**mine, **asdict(self._reader.counters)}
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Lengths of the queues: messages of other threads (outbox), bytes to send and received."""
-        return {
-            "outbox": len(self._outbox),
-            "unsent": len(self._unsent),
-            "unread": self._reader.waiting,
-        }
-
     # --- owner thread ---------------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -237,7 +232,7 @@ class Link:
 
     def _try_open(self) -> Transport | None:
         try:
-            return self._with_peer(self._open(self.endpoint))
+            return self._with_peer(self._options.opener(self.endpoint))
         except Exception as error:  # not OSError alone: a name or baud rate that a driver refuses
             self.counters.open_failures += 1
             if self.counters.open_failures == 1:
@@ -247,11 +242,12 @@ class Link:
         return None
 
     def _with_peer(self, transport: Transport) -> Transport:
+        o = self._options
         if isinstance(transport, UdpTransport):
-            if self._only is not None:
-                transport.accept_only(*self._only)
-            if self._follow_hosts_after_s is not None:
-                transport.follow_hosts_after(self._follow_hosts_after_s)
+            if o.sender is not None:
+                transport.accept_only(*o.sender)
+            if o.follow_hosts_after_s is not None:
+                transport.follow_hosts_after(o.follow_hosts_after_s)
         return transport
 
     def _serve_until_lost(self, transport: Transport) -> None:
@@ -308,9 +304,10 @@ class Link:
                 # should be on its way first. What came meanwhile has its turn at once.
                 os.read(self._wake_read, 4096)
                 deadline_ns = 0
-            if transport.stream and now_ns - last_rx_ns > self._timeout_ns:
+            timeout_s = self._options.timeout_s
+            if transport.stream and now_ns - last_rx_ns > timeout_s * 1e9:
                 self.counters.timeouts += 1
-                raise TimeoutError(f"nothing received for {self._timeout_ns * 1e-9:.1f} s")
+                raise TimeoutError(f"nothing received for {timeout_s:.1f} s")
 
     def _empty_outbox(self) -> None:
         while self._outbox:
@@ -354,8 +351,8 @@ class Link:
         packer = self._packers.get(component)
         if packer is None:
             packer = mavlink.MAVLink(None, self.system_id, component)
-            if self._key is not None:
-                signing.enable(packer, self._key, self._key_link)
+            if self._key is not None and self._options.signing is not None:
+                signing.enable(packer, self._key, self._options.signing.link_id)
             self._packers[component] = packer
         packer.srcSystem = self.system_id
         return packer

@@ -12,8 +12,9 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from io import FileIO
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -45,26 +46,12 @@ def is_disk_fault(error: OSError) -> bool:
     return error.errno in _DISK_FAULTS
 
 
-class RecordFile(Protocol):
-    """An unbuffered file opened for appending."""
-
-    def write(self, data: bytes | bytearray, /) -> int:
-        """Append; returns the number of bytes written. Raises OSError."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
-def _append_to(path: Path) -> RecordFile:
-    return path.open("ab", buffering=0)
-
-
 class TlogRecorder:
     """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
     Raises `TlogError` if the file cannot be opened, unless the disk is full or failing. Frames that
     cannot be written are dropped and counted, also beyond max_bytes. on_failure: called once with
-    the reason, in the recorder's thread. open_file: raises OSError as `Path.open` does.
+    the reason, in the recorder's thread.
     """
 
     def __init__(
@@ -72,13 +59,12 @@ class TlogRecorder:
         path: Path,
         on_failure: Callable[[str], None] = lambda _: None,
         max_bytes: int = _MAX_BYTES,
-        open_file: Callable[[Path], RecordFile] = _append_to,
     ) -> None:
-        self._file: RecordFile | None = None
+        self._file: FileIO | None = None
         self._refusal = ""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = open_file(path)
+            self._file = path.open("ab", buffering=0)
         except OSError as error:
             self._refusal = error.strerror or str(error)
             if not is_disk_fault(error):

@@ -44,6 +44,9 @@ ROI_COMMANDS = (
     mavlink.MAV_CMD_DO_SET_ROI_NONE,
 )
 WITH_PLACE = FLOWN_TO | {*TAKEOFFS, *ROI_COMMANDS}  # their x and y are degrees
+_MOST_ROUNDS = 10  # every round is alike
+# Without a radius: ArduPlane's WP_LOITER_RAD, PX4's NAV_LOITER_RAD, ArduCopter's CIRCLE_RADIUS.
+_WINGED_M, _PX4_M, _COPTER_M = 60.0, 80.0, 10.0
 _ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
 # MAV_TYPE by number: the names of some change from release to release of the dialect.
 _MULTIROTORS = frozenset((2, 3, 4, 13, 14, 15, 29, 35, 43))  # helicopters among them
@@ -142,3 +145,31 @@ def command_name(command: int) -> str:
     """MAVLink name of a command number."""
     entry = mavlink.enums["MAV_CMD"].get(command)
     return f"MAV_CMD {command}" if entry is None else str(entry.name)
+
+
+def circle_of(item: MissionItem, vehicle: MissionVehicle) -> tuple[LoiterCircle | None, list[str]]:
+    """The circle of a loiter item, None if the vehicle hovers or flies on; and notes as sentences.
+
+    A multirotor with ArduPilot flies a circle for LOITER_TURNS only; with PX4 it flies none. A
+    vehicle of unknown kind is treated as one with wings.
+    """
+    if item.command not in LOITERS:
+        return None, []
+    turns = item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS
+    if vehicle.is_multirotor and (vehicle.is_px4 or not turns):
+        return None, []
+    notes, count = [], item.parameters[0]
+    radius = item.parameters[LOITERS[item.command]]
+    if math.isnan(radius) or radius == 0:
+        usual = _PX4_M if vehicle.is_px4 else _WINGED_M
+        radius = _COPTER_M if vehicle.is_multirotor else usual
+        notes.append(
+            f"{item.label} gives no radius: judged on the firmware's default circle of "
+            f"{radius:.0f} m."
+        )
+    rounds = math.ceil(count) if turns and math.isfinite(count) and count > 0 else 1
+    if rounds > _MOST_ROUNDS:
+        notes.append(f"{item.label}: {_MOST_ROUNDS} of its {rounds} rounds are counted.")
+    elif item.command in (mavlink.MAV_CMD_NAV_LOITER_TIME, mavlink.MAV_CMD_NAV_LOITER_UNLIM):
+        notes.append(f"{item.label}: one round of its circle is judged, all are equal.")
+    return LoiterCircle(radius, min(rounds, _MOST_ROUNDS), vehicle.is_multirotor), notes

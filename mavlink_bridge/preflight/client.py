@@ -12,7 +12,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError
 from mavlink_bridge.link.link import Link, LinkOptions
-from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.transport import Endpoint
 from mavlink_bridge.vehicle.readings import is_autopilot
 
@@ -34,18 +33,10 @@ class VehicleClient:
     """
 
     def __init__(self, config: BridgeConfig, name: str, wanted: Collection[int]) -> None:
-        key = None if config.signing is None else load_key(config.signing.key_file)
         self.config = config
-        self._link = Link(
-            Endpoint.parse(config.connection),
-            self,
-            LinkOptions(
-                name=name,
-                wanted={mavlink.MAVLINK_MSG_ID_HEARTBEAT, *wanted},
-                signing_key=key,
-                signing_link_id=1 if config.signing is None else config.signing.link_id,
-            ),
-        )
+        messages = {mavlink.MAVLINK_MSG_ID_HEARTBEAT, *wanted}
+        options = LinkOptions(name=name, wanted=messages, signing=config.signing)
+        self._link = Link(Endpoint.parse(config.connection), self, options)
         self._changed = threading.Condition()
         self.system = 0
         self.component = mavlink.MAV_COMP_ID_AUTOPILOT1

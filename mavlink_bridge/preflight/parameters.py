@@ -56,11 +56,8 @@ class ParameterClient(VehicleClient):
         no answer comes in 2 s.
         """
         self._values.pop(name, None)
-        request = mavlink.MAVLink_param_request_read_message(
-            self.system, self.component, name.encode("ascii"), -1
-        )
         for _ in range(_RETRIES):
-            self.ask(request)
+            self._request(name)
             if self.wait_for(lambda: name in self._values, _ANSWER_S):
                 return self._values[name][0]
         return None
@@ -71,11 +68,7 @@ class ParameterClient(VehicleClient):
         """
         for name in names:
             self._values.pop(name, None)
-            self.ask(
-                mavlink.MAVLink_param_request_read_message(
-                    self.system, self.component, name.encode("ascii"), -1
-                )
-            )
+            self._request(name)
         self.wait_for(lambda: all(name in self._values for name in names), _ANSWER_S)
         return {name: self._values[name][0] for name in names if name in self._values}
 
@@ -100,6 +93,10 @@ class ParameterClient(VehicleClient):
             if answered and abs(self._values[name][0] - value) < 1e-3 * max(1, abs(value)):
                 return
         raise ParameterError(f"{name} = {value:g} was not taken by the flight controller")
+
+    def _request(self, name: str) -> None:
+        to = (self.system, self.component)
+        self.ask(mavlink.MAVLink_param_request_read_message(*to, name.encode("ascii"), -1))
 
     @property
     def _bytewise(self) -> bool:

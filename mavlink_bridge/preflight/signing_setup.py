@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -16,23 +15,14 @@ _REPEATS = 3
 _APART_S = 0.3
 
 
-class _KeySender(VehicleClient):
-    """Sends messages without a signature, because the autopilot has no key yet."""
-
-    def __init__(self, config: BridgeConfig) -> None:
-        super().__init__(config, "signing", ())
-
-    def take(self, message: Any) -> None:
-        """Does nothing: SETUP_SIGNING is not answered."""
-
-    def send_key(self, key: bytes) -> None:
-        """Send the key and the time a few times, because nothing acknowledges them."""
-        message = mavlink.MAVLink_setup_signing_message(
-            self.system, self.component, list(key), signing_timestamp()
-        )
-        for _ in range(_REPEATS):
-            self.ask(message)
-            self.wait_for(lambda: False, _APART_S)
+def _send(client: VehicleClient, key: bytes) -> None:
+    """Send the key and the time a few times, because nothing acknowledges them."""
+    message = mavlink.MAVLink_setup_signing_message(
+        client.system, client.component, list(key), signing_timestamp()
+    )
+    for _ in range(_REPEATS):
+        client.ask(message)
+        client.wait_for(lambda: False, _APART_S)
 
 
 def install_key(connection: str, key_file: Path) -> bool:
@@ -44,13 +34,13 @@ def install_key(connection: str, key_file: Path) -> bool:
     """
     key = load_key(key_file)
     config = BridgeConfig(connection=connection)
-    with _KeySender(config) as client:
+    with VehicleClient(config, "signing", ()) as client:
         if client.armed:
             raise BridgeStateError(f"{connection}: the vehicle is armed; disarm it, then install")
-        client.send_key(key)
+        _send(client, key)
     signed = config.model_copy(update={"signing": SigningConfig(key_file=key_file)})
     try:
-        with _KeySender(signed):
+        with VehicleClient(signed, "signing", ()):
             return True
     except ConnectionSilentError:
         return False

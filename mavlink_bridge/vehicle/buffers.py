@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -19,6 +18,7 @@ _MAX_EXTRAPOLATION_NS = 100_000_000
 _GIMBAL_FALLBACK_NS = 1_000_000_000
 _GIMBAL_GONE_NS = 3_000_000_000
 _MOST_OTHERS = 8
+_LONGEST_NS = 1 << 62  # no gap is longer
 
 # Best first: a poorer source is only used while no better one speaks.
 GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
@@ -73,14 +73,6 @@ def heading_rate(sample: Attitude) -> float:
     return (q * math.sin(sample.roll_rad) + r * math.cos(sample.roll_rad)) / cos_pitch
 
 
-def _neighbours(samples: Sequence[_Sample], time_ns: int) -> tuple[_Sample, _Sample, float]:
-    """The samples before and after time_ns, which is inside, and its share of the interval."""
-    index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
-    before, after = samples[max(index - 1, 0)], samples[index]
-    span = after.time_ns - before.time_ns
-    return before, after, (time_ns - before.time_ns) / span if span else 1.0
-
-
 class _Buffer(Generic[_Sample]):
     """History of samples in time order."""
 
@@ -96,19 +88,32 @@ class _Buffer(Generic[_Sample]):
         if not self._samples or sample.time_ns > self._samples[-1].time_ns:
             self._samples.append(sample)
 
+    @property
+    def _newest(self) -> _Sample | None:
+        return self._samples[-1] if self._samples else None
+
+    def _around(self, time_ns: int, gap_ns: int) -> tuple[_Sample, _Sample, float] | None:
+        """The samples before and after a time, and its share of the interval; None outside the
+        buffer or in a gap of more than gap_ns.
+        """
+        samples = list(self._samples)
+        if not samples or not samples[0].time_ns <= time_ns <= samples[-1].time_ns:
+            return None
+        index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
+        before, after = samples[max(index - 1, 0)], samples[index]
+        span = after.time_ns - before.time_ns
+        if span > gap_ns:
+            return None
+        return before, after, (time_ns - before.time_ns) / span if span else 1.0
+
 
 class VectorBuffer(_Buffer[VectorSample]):
     """History of vectors such as positions, with linear interpolation."""
 
     def at(self, time_ns: int) -> tuple[float, ...] | None:
         """Values interpolated at a time; None outside the buffer or in a gap of more than 0.5 s."""
-        samples = list(self._samples)
-        if not samples or not samples[0].time_ns <= time_ns <= samples[-1].time_ns:
-            return None
-        before, after, t = _neighbours(samples, time_ns)
-        if after.time_ns - before.time_ns > MAX_GAP_NS:
-            return None
-        return self._between(before.values, after.values, t)
+        found = self._around(time_ns, MAX_GAP_NS)
+        return None if found is None else self._between(found[0].values, found[1].values, found[2])
 
     def _between(self, a: tuple[float, ...], b: tuple[float, ...], t: float) -> tuple[float, ...]:
         return tuple(x + t * (y - x) for x, y in zip(a, b, strict=True))
@@ -144,20 +149,19 @@ class ZoomBuffer(_Buffer[VectorSample]):
         """The level at a time, linear between reports; None if unknown. The newest report is valid
         for hold_s, but only for 0.5 s while the level changes.
         """
-        samples = list(self._samples)
-        if not samples or time_ns < samples[0].time_ns:
-            return None
-        newest = samples[-1]
-        if time_ns > newest.time_ns:
-            moves = len(samples) > 1 and samples[-2].values != newest.values
-            held_ns = MAX_GAP_NS if moves else round(1e9 * hold_s)
+        hold_ns, newest = round(1e9 * hold_s), self._newest
+        if newest is not None and time_ns > newest.time_ns:
+            moves = len(self._samples) > 1 and self._samples[-2].values != newest.values
+            held_ns = MAX_GAP_NS if moves else hold_ns
             level = newest.values[0] if time_ns - newest.time_ns <= held_ns else math.nan
-        else:
-            before, after, t = _neighbours(samples, time_ns)
-            level = before.values[0] + t * (after.values[0] - before.values[0])
-            long_ago = after.time_ns - before.time_ns > round(1e9 * hold_s)
-            if before.values != after.values and long_ago:
-                level = math.nan  # it changed at some time between the two
+            return level if math.isfinite(level) else None
+        found = self._around(time_ns, _LONGEST_NS)
+        if found is None:
+            return None
+        before, after, t = found
+        if before.values != after.values and after.time_ns - before.time_ns > hold_ns:
+            return None  # it changed at some time between the two
+        level = before.values[0] + t * (after.values[0] - before.values[0])
         return level if math.isfinite(level) else None
 
 
@@ -183,21 +187,19 @@ class AttitudeBuffer(_Buffer[Attitude]):
 
         Up to 0.1 s after the newest sample, that is rotated on at its rates.
         """
-        samples = list(self._samples)
-        if not samples or time_ns < samples[0].time_ns:
-            return None
-        newest = samples[-1]
-        ahead = time_ns - newest.time_ns
-        if ahead >= 0:
+        newest = self._newest
+        if newest is not None and time_ns >= newest.time_ns:
+            ahead = time_ns - newest.time_ns
             if ahead > _MAX_EXTRAPOLATION_NS:
                 return None
             seconds = ahead * 1e-9
             q = quat.rotated(newest.quaternion, newest.rates, seconds)
             heading = newest.gyro_heading_rad + heading_rate(newest) * seconds
             return attitude(time_ns, q, newest.rates, heading)
-        before, after, t = _neighbours(samples, time_ns)
-        if after.time_ns - before.time_ns > MAX_GAP_NS:
+        found = self._around(time_ns, MAX_GAP_NS)
+        if found is None:
             return None
+        before, after, t = found
         q = quat.slerp(before.quaternion, after.quaternion, t)
         heading = before.gyro_heading_rad + t * (after.gyro_heading_rad - before.gyro_heading_rad)
         return attitude(time_ns, q, after.rates if t > 0.5 else before.rates, heading)
@@ -264,14 +266,12 @@ class GimbalBuffer(_Buffer[GimbalSample]):
 
     def at(self, time_ns: int) -> GimbalSample | None:
         """Attitude interpolated at a time; the newest is valid for 0.5 s. None if unknown."""
-        samples = list(self._samples)
-        if not samples or time_ns < samples[0].time_ns:
-            return None
-        newest = samples[-1]
-        if time_ns >= newest.time_ns:
+        newest = self._newest
+        if newest is not None and time_ns >= newest.time_ns:
             return newest if time_ns - newest.time_ns <= MAX_GAP_NS else None
-        before, after, t = _neighbours(samples, time_ns)
-        if after.time_ns - before.time_ns > 2 * MAX_GAP_NS:
+        found = self._around(time_ns, 2 * MAX_GAP_NS)
+        if found is None:
             return None
+        before, after, t = found
         q = quat.slerp(before.quaternion, after.quaternion, t)
         return replace(before, time_ns=time_ns, quaternion=q)

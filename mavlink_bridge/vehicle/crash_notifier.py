@@ -12,10 +12,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.alert import Alert
-from mavlink_bridge.config import BridgeConfig, SigningConfig
+from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link, LinkOptions
-from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.transport import Endpoint
 from mavlink_bridge.status import status_text
 
@@ -83,7 +82,8 @@ def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float =
         ends.append((config.ground_connection, config.ground_signing, False))
     for connection, signing, hears in ends:
         speaker = _Speaker(message, config.companion_component, config.system_id, hears=hears)
-        link = _link(connection, signing, speaker)
+        options = LinkOptions(name="last words", wanted=_HEARD, signing=signing)
+        link = Link(Endpoint.parse(connection), speaker, options)
         link.start()
         spoken.append((speaker, link))
     end_ns = monotonic_ns() + int(timeout_s * 1e9)
@@ -91,16 +91,3 @@ def report_without_bridge(config: BridgeConfig, alert: Alert, timeout_s: float =
     for _, link in spoken:
         link.stop()
     return any(sent)
-
-
-def _link(connection: str, signing: SigningConfig | None, speaker: _Speaker) -> Link:
-    return Link(
-        Endpoint.parse(connection),
-        speaker,
-        LinkOptions(
-            name="last words",
-            wanted=_HEARD,
-            signing_key=None if signing is None else load_key(signing.key_file),
-            signing_link_id=1 if signing is None else signing.link_id,
-        ),
-    )

@@ -1,4 +1,4 @@
-"""The EKF origin, and the firmwares' flat-earth conversions.
+"""The firmwares' flat-earth conversions about the EKF origin.
 
 Positions are sent as NED metres from the EKF origin. The flight controller converts them back by
 its own approximation, so the same one must be used here.
@@ -6,30 +6,16 @@ its own approximation, so the same one must be used here.
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-from mavlink_bridge.alerts.alert import Alert
-from mavlink_bridge.alerts.catalogue import alert
-from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import Origin
-
-_log = logging.getLogger(__name__)
 
 Projection = Literal["ardupilot", "px4"]
 
 # ArduPilot, AP_Common/Location.h: metres per 1e-7 degree of latitude.
 METRES_PER_DEGREE = 0.011131884502145034 * 1e7
 _PX4_RADIUS_M = 6371000.0  # PX4 lib/geo: CONSTANTS_RADIUS_OF_EARTH
-_HIGHEST_M = 20_000.0  # of an origin, or as deep below the sea
-_ASK_EVERY_NS = 1_000_000_000
-_CHECK_EVERY_NS = 10_000_000_000
-_ASKS_BEFORE_SETTING = 3
 
 
 def _longitude_scale(latitude_deg: float) -> float:
@@ -94,96 +80,3 @@ def ned_from_origin(
         origin.latitude_deg, origin.longitude_deg, latitude_deg, longitude_deg, projection
     )
     return north, east, origin.altitude_amsl_m - altitude_amsl_m
-
-
-def _is_plausible(read: Origin) -> bool:
-    """Whether it is an origin on Earth, and not 0, 0, which firmwares send before they have one."""
-    if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
-        return False
-    if not abs(read.altitude_amsl_m) <= _HIGHEST_M:
-        return False
-    return abs(read.latitude_deg) <= 90.0 and abs(read.longitude_deg) <= 180.0
-
-
-def _distance_m(a: Origin, b: Origin) -> float:
-    north, east = north_east(a.latitude_deg, a.longitude_deg, b.latitude_deg, b.longitude_deg)
-    return math.hypot(north, east, b.altitude_amsl_m - a.altitude_amsl_m)
-
-
-class OriginKeeper:
-    """Reads the vehicle's EKF origin, and sets the configured one only if there is none.
-
-    ArduPilot silently ignores a second origin, so only GPS_GLOBAL_ORIGIN shows the origin in use.
-    """
-
-    def __init__(self, configured: OriginConfig | None) -> None:
-        self.origin: Origin | None = None
-        self._configured = configured
-        self._asked = 0
-        self._next_ns = 0
-        self._told = False
-        self.moved_m: float | None = None
-        """Distance of the last received origin from the known one, m, if it was refused; else None.
-        """
-
-    def reset(self) -> None:
-        """Forget the origin and ask again: the flight controller rebooted, or may have."""
-        self.origin, self._asked, self._told, self._next_ns = None, 0, False, 0
-        self.moved_m = None
-
-    def on_origin(self, message: Any, *, armed: bool) -> Alert | None:
-        """Process GPS_GLOBAL_ORIGIN; returns an alert if the origin is new or changed.
-
-        armed: a known origin is then kept. No EKF moves its origin in flight, and a forged origin
-        would shift every position.
-        """
-        read = Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
-        self.moved_m = None
-        if not _is_plausible(read) or read == self.origin:
-            return None
-        moved = self.origin is not None
-        if self.origin is not None and armed:
-            self.moved_m = _distance_m(self.origin, read)
-            return None
-        self.origin = read
-        if moved:
-            return alert(AlertId.ORIGIN_MOVED)
-        if self._configured is not None:
-            north, east = north_east(
-                self._configured.latitude_deg,
-                self._configured.longitude_deg,
-                read.latitude_deg,
-                read.longitude_deg,
-            )
-            apart = math.hypot(north, east)
-            if apart > 1.0:
-                return alert(AlertId.ORIGIN_DIFFERS, metres=apart)
-        return alert(AlertId.ORIGIN_KNOWN)
-
-    def tick(self, now_ns: int, system_id: int, ask: Callable[[int], None]) -> Any | None:
-        """Request the origin by `ask(49)`. Returns SET_GPS_GLOBAL_ORIGIN if it is due: after three
-        requests without an origin, if one is configured.
-        """
-        if now_ns < self._next_ns:
-            return None
-        if self.origin is not None:
-            self._next_ns = now_ns + _CHECK_EVERY_NS
-            ask(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-            return None
-        self._next_ns = now_ns + _ASK_EVERY_NS
-        self._asked += 1
-        ask(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        # After setting, one more question: the answer may be under way.
-        patient = self._asked <= _ASKS_BEFORE_SETTING or self._asked % 2 == 1
-        if self._configured is None or patient:
-            return None
-        if not self._told:
-            _log.info("the vehicle has no EKF origin: setting the configured one")
-            self._told = True
-        return mavlink.MAVLink_set_gps_global_origin_message(
-            system_id,
-            round(self._configured.latitude_deg * 1e7),
-            round(self._configured.longitude_deg * 1e7),
-            round(self._configured.altitude_amsl_m * 1e3),
-            now_ns // 1000,
-        )

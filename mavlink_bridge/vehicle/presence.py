@@ -11,8 +11,6 @@ from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import VehicleState
 
 _PATIENCE_NS = 5_000_000_000
-_TWIN_WINDOW_NS = 5_000_000_000
-_TWIN_SWITCHES = 40  # in a window: even a line that damages every third frame is far below
 _NEWS = {
     "there": AlertId.FC_FOUND,
     "lost": AlertId.FC_LOST,
@@ -55,18 +53,3 @@ class VehicleWatch:
         self._report(Alert(AlertId.FC_BACK if before == "lost" else _NEWS[self._known]))
         if before == "nothing":
             self._first()
-
-
-class DuplicateSystemIdMonitor:
-    """Detects two vehicles with the same ids on one link: their boot times alternate."""
-
-    def __init__(self) -> None:
-        self._begun_ns = 0
-        self._count = 0
-
-    def is_duplicate(self, now_ns: int, ran_back: int) -> bool:
-        """Whether the boot time decreased 40 times in 5 s. ran_back: how often it has so far."""
-        many = ran_back - self._count >= _TWIN_SWITCHES
-        if many or now_ns - self._begun_ns >= _TWIN_WINDOW_NS:
-            self._begun_ns, self._count = now_ns, ran_back
-        return many

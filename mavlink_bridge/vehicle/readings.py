@@ -233,12 +233,10 @@ class VehicleReadings:
         )
 
     def _ekf_status(self, m: Any, _: int) -> None:
-        variance = _known(m.pos_horiz_variance)
-        self.state = replace(self.state, ekf_flags=m.flags, ekf_horizontal_variance=variance)
-
-    def _estimator_status(self, m: Any, _: int) -> None:
-        # PX4's innovation test ratios; the flags share their first bits with EKF_STATUS_REPORT.
-        variance = _known(m.pos_horiz_ratio)
+        # Test ratios of ArduPilot or PX4, whose flags share their first bits.
+        is_px4 = m.get_type() == "ESTIMATOR_STATUS"
+        ratio = m.pos_horiz_ratio if is_px4 else m.pos_horiz_variance
+        variance = ratio if math.isfinite(ratio) else None  # the estimator does not know it
         self.state = replace(self.state, ekf_flags=m.flags, ekf_horizontal_variance=variance)
 
     def _gps(self, m: Any, time_ns: int) -> None:
@@ -317,11 +315,6 @@ def boot_time_ns(message: Any) -> int | None:
     return None
 
 
-def _known(value: float) -> float | None:
-    """The value; None if it is not finite, because the estimator does not know it."""
-    return value if math.isfinite(value) else None
-
-
 def check_place(latitude_e7: int, longitude_e7: int) -> None:
     """ValueError for impossible coordinates in 1e-7 degrees."""
     if abs(latitude_e7) > 900_000_000 or abs(longitude_e7) > 1_800_000_000:
@@ -355,7 +348,7 @@ _HANDLERS = {
     "LOCAL_POSITION_NED": VehicleReadings._local_position,
     "GLOBAL_POSITION_INT": VehicleReadings._global_position,
     "EKF_STATUS_REPORT": VehicleReadings._ekf_status,
-    "ESTIMATOR_STATUS": VehicleReadings._estimator_status,
+    "ESTIMATOR_STATUS": VehicleReadings._ekf_status,
     "GPS_RAW_INT": VehicleReadings._gps,
     "RC_CHANNELS": VehicleReadings._rc,
     "RAW_IMU": VehicleReadings._raw_imu,

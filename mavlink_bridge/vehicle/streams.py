@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.commands import Commander
 
 _CHECK_EVERY_NS = 2_000_000_000
 _SILENT_NS = 3_000_000_000
+_VERSION_EVERY_NS = 1_000_000_000
 _OPTIONAL_ATTEMPTS = 2
 _OPTIONAL_EVERY = 30  # looks, a minute: an autopilot that boots hears no question
 
@@ -60,38 +64,50 @@ def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
 
 
 class StreamKeeper:
-    """Finds streams that have not started or have stopped. counts: messages received, by name."""
+    """Requests the firmware version, and streams that have not started or have stopped, until they
+    come; one thread. counts: messages received, by name.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, config: BridgeConfig, commander: Commander) -> None:
         self.counts: Counter[str] = Counter()
+        self._config = config
+        self._commander = commander
         self._seen_ns: dict[str, int] = {}
         self._attempts: dict[str, int] = {}
-        self._next_ns = 0
+        self._next_ns = self._next_version_ns = 0
 
     def reset(self) -> None:
-        """Forget all, because the flight controller rebooted or the link was reopened."""
+        """Request all again, because the flight controller rebooted or the link was reopened."""
         self._seen_ns.clear()
         self._attempts.clear()
-        self._next_ns = 0
+        self._next_ns = self._next_version_ns = 0
 
     def on_message(self, name: str, time_ns: int) -> None:
         """Count a message of that name."""
         self._seen_ns[name] = time_ns
         self.counts[name] += 1
 
-    def due(self, streams: tuple[Stream, ...], now_ns: int) -> list[Stream]:
-        """The streams to request now; they count as requested. Each is requested once, and again
-        while it is silent for 3 s (an optional one rarely). Empty within 2 s of the last check.
+    def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
+        """Every 2 s request what is missing: each stream once, and again while it is silent for 3 s
+        (an optional one rarely); the version every second.
         """
+        if state.version is None and now_ns >= self._next_version_ns:
+            self._next_version_ns = now_ns + _VERSION_EVERY_NS
+            wanted = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+            self._commander.send(link, mavlink.MAV_CMD_REQUEST_MESSAGE, wanted)
         if now_ns < self._next_ns:
-            return []
+            return
         self._next_ns = now_ns + _CHECK_EVERY_NS
-        return [stream for stream in streams if self._ask(stream, now_ns)]
+        interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        for stream in wanted_streams(self._config, state.autopilot):
+            if self._is_due(stream, now_ns):
+                interval_us = round(1e6 / stream.rate_hz)
+                self._commander.send(link, interval, stream.message_id, interval_us)
 
     def _is_streaming(self, name: str, now_ns: int) -> bool:
         return now_ns - self._seen_ns.get(name, -_SILENT_NS) < _SILENT_NS
 
-    def _ask(self, stream: Stream, now_ns: int) -> bool:
+    def _is_due(self, stream: Stream, now_ns: int) -> bool:
         attempts = self._attempts.get(stream.name, 0)
         if self._is_streaming(stream.name, now_ns):
             # Some stream at a default rate until they are asked once.

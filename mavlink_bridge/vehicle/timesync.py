@@ -79,7 +79,3 @@ class TimeSync:
             is_silent = now_ns - max(answered_ns, self._asking_ns) > _UNANSWERED_NS
             problem = alert(AlertId.TIMESYNC_UNANSWERED) if is_silent else None
             self._notifier.notify("timesync", problem, cleared(AlertId.TIMESYNC_UNANSWERED))
-
-    def queue_lengths(self) -> dict[str, int]:
-        """Number of unanswered requests, as the length of a queue."""
-        return {"timesync": len(self._sent)}

@@ -11,13 +11,31 @@ from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.status_notifier import StatusNotifier
-from mavlink_bridge.vehicle.presence import DuplicateSystemIdMonitor
 from mavlink_bridge.vehicle.readings import is_autopilot
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
+_WINDOW_NS = 10_000_000_000
 _TURNS = 6  # armed and disarmed again three times: nobody flies so
-_TURNS_IN_NS = 10_000_000_000
 _LIES = 3  # of TIMESYNC, which is asked once a second
+_TWIN_WINDOW_NS = 5_000_000_000
+_TWIN_SWITCHES = 40  # in a window: even a line that damages every third frame is far below
+
+
+class _Burst:
+    """Detects a counter that increases by `least` within a time."""
+
+    def __init__(self, least: int, within_ns: int = _WINDOW_NS) -> None:
+        self._least, self._within_ns = least, within_ns
+        self._count = self._begun_ns = 0
+
+    def is_found(self, count: int, now_ns: int) -> bool:
+        """Whether the counter has increased so much since the last find, or since the window began.
+        count: its value at now_ns.
+        """
+        many = count - self._count >= self._least
+        if many or now_ns - self._begun_ns > self._within_ns:
+            self._count, self._begun_ns = count, now_ns
+        return many
 
 
 class UnexpectedSenderMonitor:
@@ -34,9 +52,9 @@ class UnexpectedSenderMonitor:
         self._tracker = tracker
         self._notifier = notifier
         self._counters = counters
-        self._twins = DuplicateSystemIdMonitor()
-        self._turns = (0, 0)  # arming's at a time
-        self._lies = (0, 0)  # of TIMESYNC likewise
+        self._turns = _Burst(_TURNS)
+        self._lies = _Burst(_LIES)
+        self._ran_back = _Burst(_TWIN_SWITCHES, _TWIN_WINDOW_NS)
 
     def on_message(self, link: Link, message: Any) -> None:
         """Process a message that is not the vehicle's; only its heartbeats are used."""
@@ -65,28 +83,14 @@ class UnexpectedSenderMonitor:
             component, device = others[0]
             ignored = alert(AlertId.GIMBAL_IGNORED, component=component, device=device)
             self._notifier.notify("gimbals", ignored)
-        self._check_arming(link, now_ns)
-        clock = self._tracker.clock
-        self._check_answers(clock.contradictions, now_ns)
-        ran_back = self._twins.is_duplicate(now_ns, clock.strays + clock.reboots)
-        if ran_back or self._tracker.impostors:
-            twins = alert(AlertId.DUPLICATE_SYSTEM_ID, system=link.system_id)
-            self._notifier.notify("twins", twins)
-
-    def _check_answers(self, now: int, now_ns: int) -> None:
-        """TIMESYNC answers far from the vehicle's own time stamps come from another sender."""
-        lies, since_ns = self._lies
-        if now - lies >= _LIES:
+        clock, system = self._tracker.clock, link.system_id
+        # Heartbeats that alternate between armed and disarmed are forged.
+        if self._turns.is_found(self._tracker.arming.changes, now_ns):
+            self._notifier.notify("arming", alert(AlertId.ARMING_ALTERNATES, system=system))
+        # TIMESYNC answers far from the vehicle's own time stamps come from another sender.
+        if self._lies.is_found(clock.contradictions, now_ns):
             self._notifier.notify("answers", alert(AlertId.TIMESYNC_CONTRADICTS))
-        if now - lies >= _LIES or now_ns - since_ns > _TURNS_IN_NS:
-            self._lies = (now, now_ns)
-
-    def _check_arming(self, link: Link, now_ns: int) -> None:
-        """Heartbeats that alternate between armed and disarmed are forged."""
-        turns, since_ns = self._turns
-        now = self._tracker.arming.changes
-        if now - turns >= _TURNS:
-            forged = alert(AlertId.ARMING_ALTERNATES, system=link.system_id)
-            self._notifier.notify("arming", forged)
-        if now - turns >= _TURNS or now_ns - since_ns > _TURNS_IN_NS:
-            self._turns = (now, now_ns)
+        # Boot times alternate if two vehicles have the same ids.
+        ran_back = self._ran_back.is_found(clock.strays + clock.reboots, now_ns)
+        if ran_back or self._tracker.impostors:
+            self._notifier.notify("twins", alert(AlertId.DUPLICATE_SYSTEM_ID, system=system))

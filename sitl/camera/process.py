@@ -31,7 +31,7 @@ from sitl.camera.movers import Mover
 from sitl.camera.realism import CameraClock, CameraRealism
 from sitl.camera.stream import LossyLink, VideoSender
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
-from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera
+from sitl.camera.world_camera import SHUTTER_S, CameraOptions, FrameLog, WorldCamera
 from sitl.camera.zoom import Zooming, ZoomLens
 from sitl.errors import WorldCameraError
 
@@ -47,8 +47,8 @@ class WorldCameraConfig:
     """Configuration of the world camera's process, pickled to it.
 
     cache: tiles of the live world. origin: of the map's ENU frame, used for true poses and moving
-    objects. log: file for the true pose of every frame. threads: number used by the rasteriser.
-    targets: objects that the `Detector` reports to the address `detections`.
+    objects. log: file for the true pose of every frame. targets: objects that the `Detector`
+    reports to the address `detections`.
     """
 
     cache: Path
@@ -60,11 +60,8 @@ class WorldCameraConfig:
     appearance: Appearance = field(default_factory=Appearance)
     movers: tuple[Mover, ...] = ()
     mount: Mount = field(default_factory=Mount.from_degrees)
-    shutter_s: float = 0.005
     seed: int = 0
-    threads: int = 1
     bit_rate: int = 4_000_000
-    misp: bool = True
     targets: tuple[Observed, ...] = ()
     detections: str | None = None
     realism: CameraRealism = field(default_factory=CameraRealism)
@@ -199,7 +196,7 @@ class _CameraServer:
         cache = TileCache.open(c.cache)
         self._frame = LocalFrame(c.origin)
         self._streamer = TileStreamer(cache)
-        self._renderer = NumbaRenderer(self._streamer, threads=c.threads)
+        self._renderer = NumbaRenderer(self._streamer, threads=1)
         self._renderer.warm_up()
         self._camera = WorldCamera(
             self._renderer,
@@ -208,16 +205,15 @@ class _CameraServer:
             CameraOptions(
                 c.movers,
                 cache.frame.ecef_from_enu.inverse @ self._frame.ecef_from_enu,
-                c.shutter_s,
-                c.seed,
-                c.realism,
+                seed=c.seed,
+                realism=c.realism,
             ),
         )
         self._log = FrameLog(c.log)
         loss = c.realism.packet_loss
         self._link = LossyLink(c.url, loss, c.seed) if loss > 0 else None
         self._sender = VideoSender(
-            c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate, misp=c.misp,
+            c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate,
             link=self._link,
         )  # fmt: skip
         self._stamps = CameraClock(c.realism, c.seed)
@@ -251,7 +247,7 @@ class _CameraServer:
         """
         period_ns = round(1e9 / self._config.rate_hz)
         real = self._config.realism
-        margin_ns = round(max(self._config.shutter_s * 0.5e9, real.readout_ms * 0.5e6))
+        margin_ns = round(max(SHUTTER_S * 0.5e9, real.readout_ms * 0.5e6))
         due: int | None = None
         while True:
             self._handle(inbox.get())

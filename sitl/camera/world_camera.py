@@ -25,6 +25,7 @@ from sitl.camera.movers import Mover
 from sitl.camera.realism import CameraRealism, VibratingTrack, Vibration
 from sitl.camera.true_motion import PoseTrack
 
+SHUTTER_S = 0.005
 FRAME_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
     "true_time_ns",
@@ -55,7 +56,7 @@ class CameraOptions:
 
     movers: tuple[Mover, ...] = ()
     scene_from_world: Pose = field(default_factory=Pose.identity)
-    shutter_s: float = 0.005
+    shutter_s: float = SHUTTER_S
     seed: int = 0
     realism: CameraRealism = field(default_factory=CameraRealism)
 

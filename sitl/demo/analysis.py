@@ -163,6 +163,8 @@ def targets_inside(targets: Columns, truth_at: TruthAt, span_ns: tuple[int, int]
     squared = []
     for name, truth in truth_at.items():
         rows, offsets = _target_offsets(targets, name, truth, span_ns)
+        if not len(rows):
+            continue
         ee, en, nn = (targets[f"cov_{axes}"][rows] for axes in ("ee", "en", "nn"))
         e, n = offsets[:, 0], offsets[:, 1]
         squared.append((nn * e**2 - 2.0 * en * e * n + ee * n**2) / (ee * nn - en**2))
@@ -174,6 +176,8 @@ def _target_offsets(
     targets: Columns, name: str, truth: Mapping[int, Array], span_ns: tuple[int, int]
 ) -> tuple[np.ndarray, Array]:
     """Rows of a target's fixes in the span whose truth is known, and their errors (N, 3), ENU."""
+    if not targets:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
     times = targets["exposure_time_ns"]
     rows = np.array(
         [

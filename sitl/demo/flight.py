@@ -29,16 +29,15 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.budget import FlightErrors, draw_errors
 from sitl.demo.companion_process import (
     THIS_PROGRAM,
+    FlightCompanion,
     Ports,
     free_udp_port,
-    running_companion,
-    wait_for_console,
     write_deployment,
 )
 from sitl.demo.scenario import Scenario, VehicleChoice
-from sitl.demo.script import FlightError, FlightScript, Progress
+from sitl.demo.script import FlightScript, Progress
 from sitl.demo.targets import observed_targets
-from sitl.errors import SimulationError
+from sitl.errors import FlightError, SimulationError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import (
@@ -125,17 +124,18 @@ def fly(
         targets = observed_targets(assets, scenario, movers)
         config = write_deployment(folder, assets, scenario, vehicle, ports)
         progress("starting the world camera", 0.0)
-        filmed = FilmedFlight(assets, scenario, ports, seed, movers, targets)
         errors, gimbal_error = draw_errors(scenario, seed), GimbalError(seed)
-        camera = WorldCameraProcess(camera_config(filmed, folder))
+        filmed = camera_config(assets, scenario, ports, seed, folder, movers, targets)
+        camera = WorldCameraProcess(filmed)
         stack.enter_context(camera)
         stack.enter_context(truth_feed(pilot, camera, cache, gimbal_error, errors.map_shift_m))
         progress("starting the companion", 0.0)
         begun_ns, broken = time.monotonic_ns(), None
-        companion = stack.enter_context(running_companion(config, folder, program=program))
-        if ports.console is not None and wait_for_console(ports.console, companion):
+        companion = FlightCompanion(config, folder, stack, program=program)
+        companion.start()
+        if ports.console is not None and companion.serves(ports.console):
             observers.on_console(f"http://127.0.0.1:{ports.console}/")
-        run = FlightScript(pilot, scenario, home, folder, companion, progress)
+        run = FlightScript(pilot, scenario, home, companion, progress)
         try:
             denied_ns = run.fly()
         except SimulationError as error:
@@ -182,40 +182,30 @@ def vehicle_parameters(scenario: Scenario) -> dict[str, float]:
     return injection | GIMBAL | SPEEDS | {"WPNAV_SPEED": 100 * scenario.speed_m_s}
 
 
-@dataclass(frozen=True)
-class FilmedFlight:
-    """What a flight's world camera shows, and its output ports. targets: the objects that the
-    simulated detector reports.
+def camera_config(
+    assets: FlightAssets, scenario: Scenario, ports: Ports, seed: int, folder: Path,
+    movers: tuple[Mover, ...] = (), targets: tuple[Observed, ...] = (),
+) -> WorldCameraConfig:  # fmt: skip
+    """Configuration of a flight's world camera; true poses go to ``frames.csv`` in `folder`.
+    targets: the objects that the simulated detector reports.
     """
-
-    assets: FlightAssets
-    scenario: Scenario
-    ports: Ports
-    seed: int
-    movers: tuple[Mover, ...] = ()
-    targets: tuple[Observed, ...] = ()
-
-
-def camera_config(flight: FilmedFlight, folder: Path) -> WorldCameraConfig:
-    """Configuration of a flight's world camera; true poses go to ``frames.csv`` in `folder`."""
-    assets, look = flight.assets, np.random.default_rng([flight.seed, 11])
-    errors = draw_errors(flight.scenario, flight.seed)
+    look, errors = np.random.default_rng([seed, 11]), draw_errors(scenario, seed)
     return WorldCameraConfig(
         cache=assets.live_cache,
         origin=TileCache.open(assets.map_cache).manifest.origin,
         camera=errors.camera,
-        url=f"udp://127.0.0.1:{flight.ports.video}",
+        url=f"udp://127.0.0.1:{ports.video}",
         log=folder / "frames.csv",
-        rate_hz=flight.scenario.camera.rate_hz,
-        appearance=sample_appearance(look, flight.scenario.condition),
-        movers=flight.movers,
+        rate_hz=scenario.camera.rate_hz,
+        appearance=sample_appearance(look, scenario.condition),
+        movers=movers,
         mount=Mount.from_degrees(lever_arm_m=errors.lever_arm_m),
-        seed=flight.seed,
-        bit_rate=1000 * flight.scenario.camera.bit_rate_kbps,
+        seed=seed,
+        bit_rate=1000 * scenario.camera.bit_rate_kbps,
         realism=errors.realism,
         detector_errors=errors.detector,
-        targets=flight.targets,
-        detections=f"127.0.0.1:{flight.ports.detections}",
+        targets=targets,
+        detections=f"127.0.0.1:{ports.detections}",
     )
 
 

@@ -20,7 +20,6 @@ from companion.versions import made_by
 from companion.writing import write_result
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
-from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
 from sitl.camera.detector import FixedPoint
@@ -86,28 +85,18 @@ class FlightReport:
     slow: str | None = None
 
 
-@dataclass(frozen=True)
-class _Tables:
-    """A flight's records as they are read from its folder."""
-
-    truth: Columns
-    estimates: Columns
-    targets: Columns
-    vehicle: Columns
-
-    @classmethod
-    def read(cls, folder: Path) -> _Tables:
-        """What the camera, the companion and the vehicle left."""
-        record = folder / "companion"
-        for name in ("estimates.csv", "targets.csv"):  # of a companion that never came up
-            if not (record / name).exists():
-                raise ReportError(f"{folder}: no report of this flight: {name} was never written")
-        return cls(
-            read_columns(folder / "frames.csv"),
-            read_columns(record / "estimates.csv", text=("state", "status")),
-            read_columns(record / "targets.csv", text=("target_id", "visibility")),
-            read_columns(folder / "vehicle.csv"),
-        )
+def _tables(folder: Path) -> tuple[Columns, Columns, Columns, Columns]:
+    """What the camera (truth), the companion (estimates, targets) and the vehicle left."""
+    record = folder / "companion"
+    for name in ("estimates.csv", "targets.csv"):  # of a companion that never came up
+        if not (record / name).exists():
+            raise ReportError(f"{folder}: no report of this flight: {name} was never written")
+    return (
+        read_columns(folder / "frames.csv"),
+        read_columns(record / "estimates.csv", text=("state", "status")),
+        read_columns(record / "targets.csv", text=("target_id", "visibility")),
+        read_columns(folder / "vehicle.csv"),
+    )
 
 
 def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightReport:
@@ -115,25 +104,24 @@ def make_report(record: DemoRecord, scenario: Scenario, seed: int) -> FlightRepo
     there. `ReportError` if the companion's tables are missing.
     """
     folder, span = record.folder, record.denied_ns
-    tables = _Tables.read(folder)
-    truth, estimates, targets, vehicle = (
-        tables.truth, tables.estimates, tables.targets, tables.vehicle
-    )  # fmt: skip
+    truth, estimates, targets, vehicle = _tables(folder)
     errors = frame_errors(truth, estimates, span)
     shift_m = record.errors.map_shift_m
     absolute = ekf_errors(vehicle, span)
     horizontal = ekf_errors(vehicle, span, shift_m)
-    by_target = _target_errors(record, targets)
+    true_places = _target_truth(record, targets)
+    by_target = target_errors(targets, true_places, span)
     still = {t.name for t in record.targets if isinstance(t, FixedPoint)}
     fixed = [e for name, e in by_target.items() if name in still]
     by_target = {n: e for n, e in by_target.items() if n in still or len(e)}
+    of_fixed = {name: places for name, places in true_places.items() if name in still}
     config = load_config(folder / "companion.yaml")
     summary = localization_summary(errors)
     fixed_targets = Spread.of(np.concatenate([*fixed, np.empty(0)]))
     bounds = bound_figures(truth, estimates, span)
     judged = FlightFigures(
         summary, Spread.of(horizontal), fixed_targets, bounds.inside_bound, bounds.inside_level,
-        _fixed_inside(record, targets, still),
+        targets_inside(targets, of_fixed, span),
     )  # fmt: skip
     denied_s = (span[1] - span[0]) * 1e-9
     stages = stage_latencies(estimates, span) if estimates else {}
@@ -186,21 +174,8 @@ def _pace(
     )
 
 
-def _target_errors(record: DemoRecord, targets: Columns) -> dict[str, Array]:
-    if not len(targets):
-        return {t.name: np.empty(0) for t in record.targets}
-    return target_errors(targets, _target_truth(record, targets), record.denied_ns)
-
-
-def _fixed_inside(record: DemoRecord, targets: Columns, still: set[str]) -> float | None:
-    if not len(targets):
-        return None
-    truth = {k: v for k, v in _target_truth(record, targets).items() if k in still}
-    return targets_inside(targets, truth, record.denied_ns)
-
-
 def _target_truth(record: DemoRecord, targets: Columns) -> TruthAt:
-    times = [int(t) for t in targets["exposure_time_ns"]]
+    times = [int(t) for t in targets.get("exposure_time_ns", ())]
     return {t.name: {ns: t.position_at(ns) for ns in times} for t in record.targets}
 
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mavlink_bridge.alerts.ids import AlertId
+from sitl.demo.companion_process import FlightCompanion
 from sitl.demo.scenario import Scenario
-from sitl.errors import SimulationError
+from sitl.errors import FlightError
 from sitl.geodesy import Location
 from sitl.ground.mission_steps import MissionStep, gimbal_step, speed_step, waypoint_step
 from sitl.ground.pilot import Pilot
@@ -22,13 +19,8 @@ from sitl.vehicles.launch import VISION_SOURCE
 _TRACKING_TIMEOUT_S = 60.0
 _LEG_MARGIN_S = 60.0
 _LANDING_TIMEOUT_S = 240.0  # 120 m at 0.5 m/s near the ground
-_COMPANION_START_S = 300.0
 
 Progress = Callable[[str, float], None]
-
-
-class FlightError(SimulationError):
-    """A flight that was aborted; names the part that failed and its log."""
 
 
 class FlightScript:
@@ -39,15 +31,13 @@ class FlightScript:
         pilot: Pilot,
         scenario: Scenario,
         home: Location,
-        folder: Path,
-        companion: subprocess.Popen[bytes],
+        companion: FlightCompanion,
         progress: Progress,
     ) -> None:
         self._pilot = pilot
         self._scenario = scenario
         self._home = home
-        self._folder = folder
-        self._companion = companion
+        self.companion = companion
         self._progress = progress
         self.denied_ns: int | None = None
         """When GNSS went off, CLOCK_MONOTONIC; None before."""
@@ -58,8 +48,7 @@ class FlightScript:
         aborted.
         """
         pilot, scenario = self._pilot, self._scenario
-        self._progress("starting the companion", 0.0)
-        self.await_companion()
+        self.companion.wait_up(lambda: self._progress("starting the companion", 0.0))
         steps = mission(scenario, self._home)
         pilot.missions.upload(steps)
         pilot.point_gimbal(scenario.legs[0].gimbal_pitch_deg, 0.0)
@@ -71,7 +60,7 @@ class FlightScript:
         self._progress("waiting for the localizer to track", 0.15)
         pilot.link.wait(self._tracking, _TRACKING_TIMEOUT_S, "the localizer to track")
         pilot.link.sleep(max(0.0, scenario.deny_after_s - (pilot.record.time_s - at_height_s)))
-        self._require_companion()
+        self.companion.require()
         self._deny()
         begin_ns = self.denied_ns = time.monotonic_ns()
         pilot.start_mission()
@@ -98,7 +87,7 @@ class FlightScript:
         limit = length / self._scenario.speed_m_s * 1.5 + _LEG_MARGIN_S
         started = self._pilot.record.time_s
         while last_item not in self._pilot.record.reached:
-            self._require_companion()
+            self.companion.require()
             if self._pilot.record.mode != "AUTO":
                 raise FlightError(
                     f"the vehicle left AUTO for {self._pilot.record.mode}: "
@@ -117,40 +106,9 @@ class FlightScript:
         self._progress("landing on vision alone", 0.99)
         self._pilot.land(_LANDING_TIMEOUT_S)
 
-    def await_companion(self) -> None:
-        """Wait on the ground for the companion's first health report; the first start on a machine
-        compiles for a minute or more. `FlightError` after 300 s, or if it ends.
-        """
-        started = time.monotonic()
-        while self._health() is None:
-            self._require_companion()
-            if time.monotonic() - started > _COMPANION_START_S:
-                raise FlightError(
-                    f"the companion is not up after {_COMPANION_START_S:.0f} s; "
-                    f"{self._folder / 'companion.log'}"
-                )
-            self._progress("starting the companion", 0.0)
-            time.sleep(0.2)
-
     def _tracking(self) -> bool:
-        self._require_companion()
-        health = self._health()
-        return health is not None and list(health["alerts"]) == [AlertId.TRACKING.value]
-
-    def _health(self) -> dict[str, Any] | None:
-        """The companion's newest health report as JSON data; None before the first."""
-        try:
-            health = json.loads((self._folder / "companion" / "health.json").read_text())
-        except (OSError, ValueError):
-            return None
-        return dict(health)
-
-    def _require_companion(self) -> None:
-        code = self._companion.poll()
-        if code is not None:
-            log = self._folder / "companion.log"
-            tail = log.read_text(errors="replace")[-1500:]
-            raise FlightError(f"the companion ended with code {code}; {log}:\n{tail}")
+        self.companion.require()
+        return self.companion.health().alerts == (AlertId.TRACKING.value,)
 
 
 def mission(scenario: Scenario, home: Location) -> list[MissionStep]:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl.embedded.control.mode import Mode
+from sitl.embedded.control.px4_modes import NUMBERS, custom_mode
 from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.statustext import StatusText, TextLog
@@ -25,17 +27,11 @@ from sitl.ground.tracks import (
 VEHICLE, AUTOPILOT = 1, 1  # system and component
 _SECONDS_KEPT = 60 * 60
 
-MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9}
+MODES = {mode.name: int(mode) for mode in Mode} | {"LOITER": 5}
 _MODE_NAMES = {number: name for name, number in MODES.items()}
 # PX4's main and sub mode under the names of ArduPilot's that do the same; GUIDED: Hold.
-PX4_MODES = {
-    "STABILIZE": (7, 0),
-    "AUTO": (4, 4),
-    "GUIDED": (4, 3),
-    "RTL": (4, 5),
-    "LAND": (4, 6),
-}
-_PX4_MODE_NAMES = {main << 16 | sub << 24: name for name, (main, sub) in PX4_MODES.items()}
+PX4_MODES = {mode.name: numbers for mode, numbers in NUMBERS.items()}
+_PX4_MODE_NAMES = {custom_mode(mode): mode.name for mode in NUMBERS}
 
 
 def from_autopilot(message: Any) -> bool:

@@ -18,9 +18,10 @@ from localizer.map.cache.cache import TileCache
 from sitl.camera.movers import Mover
 from sitl.camera.world_camera import FRAME_COLUMNS
 from sitl.demo.assets import FlightAssets
+from sitl.ground.pilot import Pilot
 from sitl.operator.chase import Chase, make_chase, pursuit
 from sitl.operator.station import Station
-from sitl.suite.loop.flight import ParticipantContext
+from sitl.vehicles.process import VehicleProcess
 
 FOLLOWED_S = 60.0
 LATE_S, LATE_SIGMA_S = 0.25, 0.03  # exposure to click, of a link whose delay was measured
@@ -79,9 +80,12 @@ class Pursuer:
         return self.chase.movers
 
     @contextmanager
-    def take_part(self, context: ParticipantContext) -> Iterator[None]:
-        """Context manager: follow the car and click it in a thread; its errors go to `failure`."""
-        thread = threading.Thread(target=self._run, args=(context,), name="pursuer")
+    def take_part(self, vehicle: VehicleProcess, pilot: Pilot, frames: Path) -> Iterator[None]:
+        """Context manager: follow the car and click it in a thread; its errors go to `failure`.
+        frames: the world camera's log.
+        """
+        arguments = (vehicle, pilot, frames)
+        thread = threading.Thread(target=self._run, args=arguments, name="pursuer")
         thread.start()
         try:
             yield
@@ -89,33 +93,30 @@ class Pursuer:
             self._stop.set()
             thread.join()
 
-    def _run(self, context: ParticipantContext) -> None:
+    def _run(self, vehicle: VehicleProcess, pilot: Pilot, frames: Path) -> None:
         try:
-            vehicle = context.vehicle
             with closing(Station(vehicle.spare_endpoint, vehicle.check)) as station:
-                self._follow(context, station)
+                self._follow(pilot, frames, station)
         except Exception as error:  # told by the verdict: a dead pursuer is no passed flight
             self.failure = f"{type(error).__name__}: {error}"
 
-    def _follow(self, context: ParticipantContext, station: Station) -> None:
+    def _follow(self, pilot: Pilot, frames: Path, station: Station) -> None:
         chase = self.chase
         assert chase is not None
         begin_ns = chase.begins_ns()
         self.end_ns = begin_ns + round(FOLLOWED_S * 1e9)
         if time.monotonic_ns() > begin_ns:
             raise RuntimeError("the car had gone by before the aircraft was ready")
-        with closing(_FrameLog(context.frames)) as pictures:
-            if self._fly_along(context, station, chase, begin_ns - _STEER_NS):
+        with closing(_FrameLog(frames)) as pictures:
+            if self._fly_along(pilot, station, chase, begin_ns - _STEER_NS):
                 return
             pictures.newest()  # what there is so far is read before it counts
             if station.run_until(self._stop.is_set, begin_ns):
                 return
             self._click(station, chase, *pictures.newest())
-        self._fly_along(context, station, chase, self.end_ns)
+        self._fly_along(pilot, station, chase, self.end_ns)
 
-    def _fly_along(
-        self, context: ParticipantContext, station: Station, chase: Chase, until_ns: int
-    ) -> bool:
+    def _fly_along(self, pilot: Pilot, station: Station, chase: Chase, until_ns: int) -> bool:
         """Steer above the car until until_ns; True if the flight ended before that time."""
         home_m = self._home_up_m()
         while time.monotonic_ns() < until_ns:
@@ -123,7 +124,7 @@ class Pursuer:
             # Until the car comes, the aircraft waits where it will be met.
             place = pursuit(chase.car, max(ahead_ns, chase.begins_ns()), self._height_m, _BEHIND_M)
             latitude, longitude, _ = self._frame.geodetic_from_enu(place)
-            context.pilot.go_to(float(latitude), float(longitude), float(place[2]) - home_m)
+            pilot.go_to(float(latitude), float(longitude), float(place[2]) - home_m)
             if station.run_until(self._stop.is_set, min(time.monotonic_ns() + _STEER_NS, until_ns)):
                 return True
         return False

@@ -171,15 +171,26 @@ def load_case(path: Path, model: type[AnyCase]) -> AnyCase:
         raise ScenarioError(f"{path}:\n{error}") from error
 
 
-def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Case, ...]:
-    """All scenarios of a folder, or those named; ScenarioError for a name that is not there."""
-    files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+def load_all(folder: Path, model: type[AnyCase]) -> dict[str, AnyCase]:
+    """All scenarios of a folder by name; `ScenarioError` without any."""
+    files = sorted(folder.glob("*.yaml"))
     if not files:
         raise ScenarioError(f"{folder}: holds no scenario files (NAME.yaml)")
-    chosen = list(names) or list(files)
-    unknown = [name for name in chosen if name not in files]
+    return {path.stem: load_case(path, model) for path in files}
+
+
+def require_known(names: Iterable[str], known: Iterable[str], folder: Path) -> None:
+    """`ScenarioError` for names that are not there."""
+    known = list(known)
+    unknown = [name for name in names if name not in known]
     if unknown:
         raise ScenarioError(
-            f"no scenario {', '.join(unknown)} in {folder}; there are: {', '.join(files)}"
+            f"no scenario {', '.join(unknown)} in {folder}; there are: {', '.join(known)}"
         )
-    return tuple(load_case(files[name], Case) for name in chosen)
+
+
+def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Case, ...]:
+    """All scenarios of a folder, or those named; ScenarioError for a name that is not there."""
+    cases, names = load_all(folder, Case), list(names)
+    require_known(names, cases, folder)
+    return tuple(cases[name] for name in names or cases)

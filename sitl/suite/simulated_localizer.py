@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -55,46 +54,6 @@ class FixModel(BaseModel):
     odometry_scale: float | None = Field(None, gt=-0.5, lt=1.0)
 
 
-@dataclass(frozen=True)
-class Observation:
-    """One noisy pose: NED metres from an origin, radians, m/s NED."""
-
-    position_ned: Vector
-    roll_pitch_yaw: Vector
-    velocity_ned: Vector
-
-
-class Observer:
-    """Draws noisy poses from the truth."""
-
-    def __init__(self, seed: int) -> None:
-        self._rng = np.random.default_rng(seed)
-        self._lags = np.random.default_rng([seed, 1])
-
-    def latency_s(self, model: FixModel) -> float:
-        """Random latency from exposure to submission of a fix, seconds."""
-        spread = model.latency_spread_ms
-        drawn = self._lags.uniform(0.0, spread) if spread else 0.0
-        return (model.latency_ms + drawn) * 1e-3
-
-    def observe(self, truth: Truth, origin: Location, model: FixModel) -> Observation:
-        """A noisy pose of `truth` with the errors of `model`, NED metres from `origin`."""
-        draw = self._rng.standard_normal(9)
-        position = np.array(origin.ned_of(truth.location)) + model.sigma_m * draw[0:3]
-        position[0] += model.offset_north_m
-        turn = math.radians(model.rotation_deg)
-        attitude_sigma = math.radians(model.attitude_sigma_deg)
-        angles = np.array(truth.roll_pitch_yaw) + attitude_sigma * draw[3:6]
-        angles[2] += math.radians(model.yaw_error_deg) + turn
-        velocity = truth.velocity_ned + (model.velocity_sigma_mps or 0.0) * draw[6:9]
-        about = np.array([*model.turns_about_m, 0.0])
-        return Observation(
-            _three(about + matrix(quaternion(0.0, 0.0, turn)) @ (position - about)),
-            _three(angles),
-            _three(velocity),
-        )
-
-
 class FixSink(Protocol):
     """Receives fixes: the bridge, or the integrity monitor before the bridge."""
 
@@ -124,7 +83,8 @@ class BridgeFeed:
         self._model, self._resets = model, 0
         self._hung: Truth | None = None
         self._left: Vector | None = None  # where the map ended
-        self._observer = Observer(seed)
+        self._rng = np.random.default_rng(seed)
+        self._lags = np.random.default_rng([seed, 1])
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fixes", daemon=True)
@@ -146,24 +106,42 @@ class BridgeFeed:
             with self._lock:
                 model = self._model
             exposure += 1.0 / model.rate_hz
-            due = exposure + self._observer.latency_s(model)
+            due = exposure + self._latency_s(model)
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
             truth = self.pilot.record.truth_at(int(exposure * 1e9))
             if truth is not None and not model.silent:
                 self._sink.submit(self._fix(truth))
 
+    def _latency_s(self, model: FixModel) -> float:
+        """Random latency from exposure to submission of a fix."""
+        spread = model.latency_spread_ms
+        drawn = self._lags.uniform(0.0, spread) if spread else 0.0
+        return (model.latency_ms + drawn) * 1e-3
+
+    def _observed(self, truth: Truth, model: FixModel, sigma_m: float) -> tuple[Any, Any, Any]:
+        """A noisy pose of `truth`, each (3,): NED metres from home, Euler angles, NED m/s."""
+        draw = self._rng.standard_normal(9)
+        turn = math.radians(model.rotation_deg)
+        place = np.array(self._home.ned_of(truth.location)) + sigma_m * draw[0:3]
+        place[0] += model.offset_north_m
+        about = np.array([*model.turns_about_m, 0.0])
+        place = about + matrix(quaternion(0.0, 0.0, turn)) @ (place - about)
+        angles = np.array(truth.roll_pitch_yaw) + math.radians(model.attitude_sigma_deg) * draw[3:6]
+        angles[2] += math.radians(model.yaw_error_deg) + turn
+        velocity = truth.velocity_ned + (model.velocity_sigma_mps or 0.0) * draw[6:9]
+        return place, angles, velocity
+
     def _fix(self, truth: Truth) -> VisionFix:
         with self._lock:
             model, resets = self._model, self._resets
         self._hung = (self._hung or truth) if model.frozen else None
-        shown, seen_as = truth, model
+        shown, sigma_m = truth, model.sigma_m
         if self._hung is not None:
-            shown = self._hung
-            seen_as = model.model_copy(update={"sigma_m": _FROZEN_SHARE * model.sigma_m})
-        seen = self._observer.observe(shown, self._home, seen_as)
-        place, variance = np.array(seen.position_ned), model.sigma_m**2
-        self._left = None if model.odometry_scale is None else self._left or seen.position_ned
+            shown, sigma_m = self._hung, _FROZEN_SHARE * model.sigma_m
+        place, angles, velocity = self._observed(shown, model, sigma_m)
+        variance = model.sigma_m**2
+        self._left = None if model.odometry_scale is None else self._left or _three(place)
         if self._left is not None:
             way = (place - self._left) * (1.0, 1.0, 0.0)
             place = place + (model.odometry_scale or 0.0) * way
@@ -175,11 +153,11 @@ class BridgeFeed:
             where.latitude_deg,
             where.longitude_deg,
             where.altitude_m + self._geoid_m,
-            quat.from_euler(*seen.roll_pitch_yaw),
+            quat.from_euler(*_three(angles)),
             np.eye(3) * variance,
             math.radians(model.attitude_sigma_deg),
             reset_count=resets,
-            velocity_ned=None if measured is None else seen.velocity_ned,
+            velocity_ned=None if measured is None else _three(velocity),
             velocity_sigma_mps=measured or 0.3,
             scale_sigma=None if self._left is None else _ODOMETRY_SCALE,
         )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
-from sitl.geodesy import Location
 from sitl.vehicles.process import PARAMETERS, VehicleProcess, VehicleProcessError
 
 # Where a binary and its default parameters lie below ARDUPILOT_HOME: an install folder, or an
@@ -50,21 +50,13 @@ def find_defaults(binary: Path) -> Path:
 
 
 class ArduPilotSitl(VehicleProcess):
-    """ArduCopter SITL at `home` (AMSL) with `parameters` over ArduPilot's defaults.
-    `ArduPilotNotFoundError` without its binary.
-    """
+    """ArduCopter SITL. `ArduPilotNotFoundError` without its binary."""
 
     kind = "ardupilot"
     start_timeout_s = 30.0
 
-    def __init__(
-        self,
-        home: Location,
-        heading_deg: float = 0.0,
-        parameters: dict[str, float] | None = None,
-        speedup: float = 1.0,
-        log: Path | None = None,
-    ) -> None:
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
         binary = find_arducopter()
         if binary is None:
             raise ArduPilotNotFoundError(
@@ -72,8 +64,6 @@ class ArduPilotSitl(VehicleProcess):
                 "`./waf configure --board sitl && ./waf copter`, or fly the embedded vehicle"
             )
         self._binary, self._defaults = binary, find_defaults(binary)
-        super().__init__(parameters, speedup, log)
-        self._home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
 
     def command(self, instance: int) -> list[str]:
         """See `VehicleProcess.command`; -w forgets parameters of earlier runs."""
@@ -82,7 +72,7 @@ class ArduPilotSitl(VehicleProcess):
             "--model=quad",
             f"--speedup={self.speedup:g}",
             f"-I{instance}",
-            f"--home={self._home}",
+            f"--home={self.home}",
             f"--defaults={self._defaults},{PARAMETERS}",
             "--serial0=tcp:0",
             "-w",

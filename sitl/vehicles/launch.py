@@ -113,25 +113,10 @@ def _sources(number: int, *, position: int, velocity: int, climb: int) -> dict[s
 
 
 class EmbeddedSitl(VehicleProcess):
-    """The embedded vehicle as a process of its own. px4: see `sitl.embedded.px4_parameters`."""
+    """The embedded vehicle as a process of its own."""
 
     kind = "embedded"
     start_timeout_s = 300.0  # the first start compiles the kernels
-
-    def __init__(
-        self,
-        home: Location,
-        heading_deg: float = 0.0,
-        parameters: dict[str, float] | None = None,
-        speedup: float = 1.0,
-        seed: int = 0,
-        log: Path | None = None,
-        px4: bool = False,
-    ) -> None:
-        super().__init__(parameters, speedup, log)
-        self._px4 = px4
-        self._home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
-        self._seed = seed
 
     def command(self, instance: int) -> list[str]:
         """See `VehicleProcess.command`."""
@@ -139,20 +124,18 @@ class EmbeddedSitl(VehicleProcess):
             sys.executable,
             "-m",
             "sitl.embedded",
-            f"--home={self._home}",
+            f"--home={self.home}",
             f"--port={BASE_PORT + PORTS_PER_INSTANCE * instance}",
             f"--params={PARAMETERS}",
             f"--speedup={self.speedup:g}",
-            f"--seed={self._seed}",
-            *(["--px4"] if self._px4 else []),
+            f"--seed={self.seed}",
+            *(["--px4"] if self.px4 else []),
         ]
 
 
 @dataclass(frozen=True)
 class VehicleSetup:
-    """Start conditions of a vehicle. parameters: added to the defaults; seed: of the embedded
-    vehicle's noise; log: file for its output; px4: the embedded vehicle with PX4's interface.
-    """
+    """Start conditions of a vehicle, see `VehicleProcess`."""
 
     heading_deg: float = 0.0
     parameters: dict[str, float] | None = None
@@ -176,6 +159,4 @@ def open_vehicle(
     if s.px4 and kind == "ardupilot":
         raise VehicleProcessError("a scenario of PX4 flies on the embedded vehicle: --fc embedded")
     found = kind == "auto" and not s.px4 and find_arducopter() is not None
-    if kind == "ardupilot" or found:
-        return ArduPilotSitl(home, s.heading_deg, s.parameters, s.speedup, s.log)
-    return EmbeddedSitl(home, s.heading_deg, s.parameters, s.speedup, s.seed, s.log, s.px4)
+    return (ArduPilotSitl if kind == "ardupilot" or found else EmbeddedSitl)(home, **vars(s))

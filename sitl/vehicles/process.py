@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from sitl.errors import SimulationError
+from sitl.geodesy import Location
 
 VehicleKind = Literal["ardupilot", "embedded"]
 
@@ -44,18 +45,20 @@ class VehicleProcess(ABC):
 
     It runs in a temporary folder that is removed at its end, also after a crash. Its output goes to
     a file there, or to `log`, which stays; errors quote the end of it.
+
+    home: altitude AMSL. parameters: over the vehicle's defaults. seed, px4: the embedded vehicle's
+    noise, and whether it has PX4's interface (`sitl.embedded.px4_parameters`).
     """
 
     kind: VehicleKind
     start_timeout_s: float
 
     def __init__(
-        self,
-        parameters: dict[str, float] | None = None,
-        speedup: float = 1.0,
-        log: Path | None = None,
-    ) -> None:
-        self.speedup = speedup
+        self, home: Location, heading_deg: float = 0.0, parameters: dict[str, float] | None = None,
+        speedup: float = 1.0, seed: int = 0, log: Path | None = None, px4: bool = False,
+    ) -> None:  # fmt: skip
+        self.home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
+        self.speedup, self.seed, self.px4 = speedup, seed, px4
         self._parameters = parameters or {}
         self._log = log
         self._folder: Path | None = None

@@ -45,7 +45,6 @@ def refused(
         ("gpu_checklist --map /no/such/cache", "/no/such/cache"),
         ("gpu_checklist --minutes -1", "--minutes"),
         ("places run . --frames 301", "--frames"),
-        ("places run . --places atlantis", "atlantis"),
         ("places table . --plot /no/such/folder/a.png", "/no/such/folder"),
         ("targets 0 --height 5", "--height"),
         ("throughput run . --widths 0", "--widths"),

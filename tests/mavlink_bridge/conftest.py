@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import contextlib
 import select
 import socket
 import threading
@@ -210,23 +210,41 @@ def make_autopilot() -> Iterator[Callable[..., FakeAutopilot]]:
         fake.stop()
 
 
+class GroundStation:
+    """Listens on UDP for what the bridge's ground link says."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(0.1)
+        self.port = self.socket.getsockname()[1]
+        self.received: list[Any] = []
+        self.peer: Any = None
+        self._codec = mavlink.MAVLink(None, 255, 190)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with contextlib.suppress(TimeoutError):
+                data, self.peer = self.socket.recvfrom(65536)
+                self.received += self._codec.parse_buffer(data) or []
+
+    def of(self, name: str) -> list[Any]:
+        return [m for m in list(self.received) if m.get_type() == name]
+
+    def send(self, message: Any, system: int = 255) -> None:
+        self.socket.sendto(message.pack(mavlink.MAVLink(None, system, 190)), self.peer)
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.socket.close()
+
+
 @pytest.fixture
-def quaternion_of() -> Callable[[float, float, float], list[float]]:
-    """(w, x, y, z) of aerospace angles in degrees, by half-angle composition of three turns."""
-
-    def make(roll: float, pitch: float, yaw: float) -> list[float]:
-        def multiply(a: list[float], b: list[float]) -> list[float]:
-            return [
-                a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-                a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-                a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-                a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-            ]
-
-        r, p, y = (math.radians(angle) / 2.0 for angle in (roll, pitch, yaw))
-        qx = [math.cos(r), math.sin(r), 0.0, 0.0]
-        qy = [math.cos(p), 0.0, math.sin(p), 0.0]
-        qz = [math.cos(y), 0.0, 0.0, math.sin(y)]
-        return multiply(multiply(qz, qy), qx)
-
-    return make
+def ground() -> Iterator[GroundStation]:
+    station = GroundStation()
+    yield station
+    station.stop()

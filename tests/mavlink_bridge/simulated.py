@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.generator.mavcrc import x25crc
 
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
@@ -24,6 +26,9 @@ from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.transport import Endpoint
 from mavlink_bridge.messages import PlaceHint, TrackRequest
 from mavlink_bridge.shared import Shared
+from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.vehicle.commands import Commander
+from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -233,13 +238,9 @@ class Flight:
         for decoded in self.reader.feed(self.mangle(frame)):
             self.end.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]
 
-    def queue_lengths(self) -> dict[str, int]:
-        """Lengths of everything that could grow."""
-        return {
-            **self.end.queue_lengths(),
-            "bytes": self.reader.waiting,
-            "sequences": self.reader.sources,
-        }
+    def longest(self) -> int:
+        """Length of the longest of all collections, any of which might grow."""
+        return max((lengths(self.end) | lengths(self.reader)).values())
 
     def attitude_error(self, age_ns: int = 200 * MS) -> float:
         """Error of the interpolated yaw at an exposure, rad; NaN while there is none."""
@@ -247,3 +248,48 @@ class Flight:
         if at is None:
             return math.nan
         return abs(quat.wrap_pi(at.yaw_rad - self.yaw(self.now_ns - age_ns)))
+
+
+def lengths(of: Any, seen: set[int] | None = None) -> dict[str, int]:
+    """The length of each collection that an object holds, and the bridge's objects in it, by the
+    attribute's name; the longest of those of one name.
+    """
+    seen, found = seen or {id(of)}, Counter[str]()
+    for name, value in list(vars(of).items()):
+        ours = type(value).__module__.startswith("mavlink_bridge") and hasattr(value, "__dict__")
+        if isinstance(value, deque | dict | list | set | bytearray):
+            found |= Counter({name.lstrip("_"): len(value)})
+        elif ours and id(value) not in seen:
+            seen.add(id(value))
+            found |= Counter(lengths(value, seen))
+    return found
+
+
+def exchanging(
+    configured: OriginConfig | None,
+) -> tuple[OriginExchange, Any, list[Alert]]:
+    """An exchange of the EKF's origin with a vehicle that is not armed, its link and its alerts."""
+    told: list[Alert] = []
+    tracker = VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), True)
+    config, notifier = BridgeConfig(origin=configured), StatusNotifier(told.append)
+    exchange = OriginExchange(config, tracker, Commander(191), notifier, Counter())
+    return exchange, SimulatedLink(system_id=1), told
+
+
+def heartbeat(autopilot: int = 3, *, armed: bool = True) -> Any:
+    """HEARTBEAT of a copter's autopilot."""
+    return mavlink.MAVLink_heartbeat_message(2, autopilot, 209 if armed else 81, 4, 4, 3)
+
+
+def origin_message(north_m: float) -> Any:
+    """GPS_GLOBAL_ORIGIN so far north of home."""
+    latitude, longitude = (round(degrees * 1e7) for degrees in (HOME[0] + north_m * METRE, HOME[1]))
+    return mavlink.MAVLink_gps_global_origin_message(latitude, longitude, 488_000, 0)
+
+
+def frame_of(known: Any, payload: bytes, system: int = 1, component: int = 1) -> bytes:
+    """A frame of any payload of a message class, its checksum right."""
+    header = bytes([len(payload), 0, 0, 0, system, component]) + known.id.to_bytes(3, "little")
+    crc = x25crc(header + payload)
+    crc.accumulate(bytes([known.crc_extra]))
+    return b"\xfd" + header + payload + crc.crc.to_bytes(2, "little")

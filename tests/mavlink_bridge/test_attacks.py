@@ -4,58 +4,31 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v10 import ardupilotmega as first_version
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import SenderRefusal
+from mavlink_bridge.components import Components
 from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig, SigningConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.replay import ReplayWindow
-from mavlink_bridge.link.signing import create_key
-from tests.mavlink_bridge.simulated import HOME, METRE, Flight
+from tests.mavlink_bridge.simulated import HOME, METRE, Flight, heartbeat, origin_message
 
 KEY = bytes(range(1, 33))
 COMMAND = mavlink.MAV_CMD_USER_1
 
 
-def origin_message(north_m: float) -> Any:
-    latitude = HOME[0] + north_m * METRE
-    return mavlink.MAVLink_gps_global_origin_message(
-        round(latitude * 1e7), round(HOME[1] * 1e7), 488_000, 0
-    )
-
-
-def heartbeat(*, armed: bool) -> Any:
-    return mavlink.MAVLink_heartbeat_message(2, 3, 81 | (128 if armed else 0), 4, 4, 3)
-
-
 # --- the origin -------------------------------------------------------------------------------
-
-
-def test_a_forged_origin_does_not_drag_the_positions(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = Flight(monkeypatch)
-    flight.run(12.0)
-    before = flight.end.origin.origin
-    assert before is not None
-    flight.say(heartbeat(armed=True))
-    for _ in range(5):
-        flight.say(origin_message(60.0))
-    assert flight.end.origin.origin == before
-    (told,) = flight.told(AlertId.ORIGIN_REFUSED)
-    assert told.values[0] == pytest.approx(60.0, abs=0.5)
-    assert flight.end.counters["origins_refused"] == 5
-    start_ns = flight.now_ns
-    flight.run(2.0)
-    sent = flight.vision(start_ns)
-    assert sent
-    assert all(abs(message.x) < 1.0 for _, message in sent)
 
 
 def test_a_forged_disarming_opens_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,15 +77,8 @@ def test_armed_and_disarmed_in_turn_is_told_and_arming_twice_is_not(monkeypatch,
         flight.run(1.1)
     told = flight.told(AlertId.ARMING_ALTERNATES)
     assert told == [alert(AlertId.ARMING_ALTERNATES, system=1)] * forged
-
-
-def test_a_disarming_that_lasts_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = Flight(monkeypatch)
-    flight.armed = True
-    flight.run(3.0)
-    flight.armed = False
     flight.run(4.0)
-    assert not flight.shared.tracker.snapshot(flight.now_ns).armed
+    assert not flight.shared.tracker.snapshot(flight.now_ns).armed  # what lasts is believed
 
 
 def test_an_origin_that_moves_on_the_ground_or_with_a_reboot_is_followed(monkeypatch):
@@ -140,15 +106,30 @@ class Orders:
         self.flight = Flight(monkeypatch, self.enable, **options)
         self.flight.run(2.0)
 
-    def command(self, system: int, command: int, component: int) -> list[int]:
+    def command(
+        self, system: int, command: int, component: int, *, to: int = 1, wanted: float = 1.0
+    ) -> list[int]:
         """The results that a COMMAND_LONG is answered with."""
-        codec = mavlink.MAVLink(None, system, 190)
-        message = mavlink.MAVLink_command_long_message(1, component, command, 0, 1.0, *[0.0] * 6)
+        message = mavlink.MAVLink_command_long_message(
+            to, component, command, 0, wanted, *[0.0] * 6
+        )
         before = len(self.flight.link.sent)
-        for decoded in self.flight.reader.feed(bytes(message.pack(codec))):
-            self.flight.end.on_message(self.flight.link, decoded, self.flight.now_ns)
+        self.flight.say(message, system=system, component=190)
         sent = [m for _, m, _ in self.flight.link.sent[before:]]
         return [m.result for m in sent if m.get_type() == "COMMAND_ACK"]
+
+
+def test_the_ground_stations_order_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
+    orders = Orders(monkeypatch)
+    assert orders.command(255, COMMAND, 197, to=2) == []  # another vehicle's
+    assert orders.command(255, mavlink.MAV_CMD_USER_2, 197) == [mavlink.MAV_RESULT_UNSUPPORTED]
+    assert orders.command(255, COMMAND, 197, wanted=math.nan) == [mavlink.MAV_RESULT_DENIED]
+    assert not orders.enable.enabled
+    for wanted in (1.0, 1.0, 0.0):  # sent again
+        assert orders.command(255, COMMAND, 197, wanted=wanted) == [mavlink.MAV_RESULT_ACCEPTED]
+        assert orders.enable.enabled is (wanted == 1.0)
+    second = Orders(monkeypatch, ground_systems=(254, 66))
+    assert second.command(66, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
 
 
 @pytest.mark.parametrize(
@@ -169,17 +150,7 @@ def test_orders_of_other_systems_are_denied_and_told_once(monkeypatch, command, 
     assert orders.command(66, mavlink.MAV_CMD_REQUEST_MESSAGE, 100) != []  # a question
 
 
-def test_the_ground_stations_order_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
-    orders = Orders(monkeypatch)
-    assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
-    assert orders.enable.enabled
-    second = Orders(monkeypatch, ground_systems=(254, 66))
-    assert second.command(66, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
-
-
 def test_with_signing_an_unsigned_ground_link_gives_no_orders(monkeypatch, tmp_path):
-    from mavlink_bridge.components import Components
-
     signing = SigningConfig(key_file=tmp_path / "key")
     orders = Orders(monkeypatch, signing=signing, ground_connection="udpout:127.0.0.1:1")
     orders.flight.end.components = Components(orders.flight.shared, ground=True)
@@ -208,18 +179,12 @@ def signed(stamp: int, system: int = 255) -> bytes:
     return bytes(message.pack(codec))
 
 
-class Process:
+@contextlib.contextmanager
+def process(path: Path) -> Iterator[FrameReader]:
     """One life of a signed link's reader."""
-
-    def __init__(self, path: Path) -> None:
-        self.window = ReplayWindow(path)
-        self.reader = FrameReader(None, KEY, self.window)
-
-    def takes(self, frame: bytes) -> bool:
-        return bool(self.reader.feed(frame))
-
-    def end(self) -> None:
-        self.window.close()
+    window = ReplayWindow(path)
+    yield FrameReader(None, KEY, window)
+    window.close()
 
 
 @pytest.fixture
@@ -232,53 +197,42 @@ STAMP = 1_000_000_000
 
 @pytest.mark.usefixtures("unset_clock")
 def test_a_recorded_order_is_refused_after_a_restart_though_the_clock_is_unset(tmp_path):
+    """Our own stamps begin beyond all that was seen, so that an autopilot follows that does not
+    know the time, and is heard at once.
+    """
     path = tmp_path / "seen"
-    first = Process(path)
-    assert first.takes(signed(STAMP))
-    first.end()
+    with process(path) as first:
+        assert first.feed(signed(STAMP))
     assert path.stat().st_mode & 0o777 == 0o600
-    second = Process(path)
-    assert not second.takes(signed(STAMP))
-    assert not second.takes(signed(STAMP - 10_000_000, system=254)), (
-        "recorded when it was not heard"
-    )
-    assert second.takes(signed(STAMP + 300_000)), "3 s later: the station goes on"
-    second.end()
+    with process(path) as second:
+        assert not second.feed(signed(STAMP))
+        assert not second.feed(signed(STAMP - 10_000_000, system=254))  # when it was not heard
+        assert second.signing_timestamp > STAMP
+        assert second.feed(signed(second.signing_timestamp + 1, system=1))
+        assert second.feed(signed(STAMP + 300_000)), "3 s later: the station goes on"
 
 
 @pytest.mark.usefixtures("unset_clock")
 def test_an_order_that_comes_in_the_last_write_is_not_taken_again(tmp_path, monkeypatch):
     """The end came while the disk wrote what was heard before it."""
-    first, late, wrote = Process(tmp_path / "seen"), [], threading.Event()
+    window, late, wrote = ReplayWindow(tmp_path / "seen"), [], threading.Event()
+    first = FrameReader(None, KEY, window)
 
     def meanwhile(_: int) -> None:
         if wrote.is_set():
             return
-        late.append(first.takes(signed(STAMP + 600_000, system=254)))
+        late.extend(first.feed(signed(STAMP + 600_000, system=254)))
         with contextlib.suppress(RuntimeError):  # the writer does not wait for itself
-            first.end()
+            window.close()
         wrote.set()
 
     monkeypatch.setattr("mavlink_bridge.atomic_file.os.fsync", meanwhile)
-    assert first.takes(signed(STAMP))
+    assert first.feed(signed(STAMP))
     assert wrote.wait(20.0)
-    first.end()
-    assert late == [True]
-    second = Process(tmp_path / "seen")
-    assert not second.takes(signed(STAMP + 600_000, system=254))
-    second.end()
-
-
-@pytest.mark.usefixtures("unset_clock")
-def test_our_own_stamps_begin_beyond_all_that_was_seen(tmp_path: Path) -> None:
-    """So that an autopilot that does not know the time follows, and is heard at once."""
-    first = Process(tmp_path / "seen")
-    assert first.takes(signed(STAMP, system=1))
-    first.end()
-    second = Process(tmp_path / "seen")
-    assert second.reader.signing_timestamp > STAMP
-    assert second.takes(signed(second.reader.signing_timestamp + 1, system=1))
-    second.end()
+    window.close()
+    assert len(late) == 1
+    with process(tmp_path / "seen") as second:
+        assert not second.feed(signed(STAMP + 600_000, system=254))
 
 
 @pytest.mark.usefixtures("unset_clock")
@@ -302,30 +256,22 @@ def test_our_own_stamps_begin_beyond_all_that_was_seen(tmp_path: Path) -> None:
 def test_a_damaged_state_is_told_and_begun_anew(tmp_path, content, caplog):
     path = tmp_path / "seen"
     path.write_text(content)
-    with caplog.at_level(logging.WARNING):
-        process = Process(path)
-    assert "restarted, messages" in caplog.text
-    assert process.takes(signed(STAMP))
-    process.end()
-    again = Process(path)
-    assert not again.takes(signed(STAMP))
-    again.end()
+    with caplog.at_level(logging.WARNING), process(path) as reader:
+        assert "restarted, messages" in caplog.text
+        assert reader.feed(signed(STAMP))
+    with process(path) as again:
+        assert not again.feed(signed(STAMP))
 
 
 def test_a_place_that_cannot_be_written_is_told_and_the_link_goes_on(tmp_path, caplog):
-    process = Process(tmp_path / "none" / "seen")
-    with caplog.at_level(logging.WARNING):
-        assert process.takes(signed(10**14))
-        process.end()
+    with caplog.at_level(logging.WARNING), process(tmp_path / "none" / "seen") as reader:
+        assert reader.feed(signed(10**14))
     assert caplog.text.count("set signing.state_file") == 1
 
 
-def test_mavlink_1_is_refused_where_signing_is_on(tmp_path: Path) -> None:
-    from pymavlink.dialects.v10 import ardupilotmega as first
-
-    create_key(tmp_path / "key")
-    message = first.MAVLink_command_long_message(1, 197, COMMAND, 0, 1.0, *[0.0] * 6)
-    frame = bytes(message.pack(first.MAVLink(None, 255, 190)))
+def test_mavlink_1_is_refused_where_signing_is_on() -> None:
+    message = first_version.MAVLink_command_long_message(1, 197, COMMAND, 0, 1.0, *[0.0] * 6)
+    frame = bytes(message.pack(first_version.MAVLink(None, 255, 190)))
     assert FrameReader().feed(frame), "it is one that would be taken without signing"
     reader = FrameReader(None, KEY)
     assert not reader.feed(frame)

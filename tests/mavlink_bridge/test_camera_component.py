@@ -1,12 +1,13 @@
 """What the camera component tells of targets, and that an ended one is told no more."""
 
+import math
 from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.camera.component import CameraComponent
-from mavlink_bridge.camera.marks import Marks
+from mavlink_bridge.camera.component import CameraComponent, Marks
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
 
@@ -30,7 +31,6 @@ def test_a_target_that_is_forgotten_is_told_no_more_and_the_others_are():
     assert told(11 * SECOND) == [474000000]
     component.forget(4)
     assert told(11 * SECOND + SECOND // 2) == []
-    assert component.targets == 0
 
 
 def test_marks_of_fresh_targets_without_end_take_no_memory_without_end():
@@ -88,6 +88,22 @@ def test_the_answer_to_a_click_says_its_number_and_a_repeated_command_begins_no_
     station.send(STOP, 2.0)
     station.send(STOP, float("nan"))
     assert [r.number for r in station.asked[3:]] == [0, 2, 0]
+
+
+def test_a_stations_questions_are_answered_and_what_is_no_request_is_denied():
+    station = Station()
+    assert station.send(mavlink.MAV_CMD_REQUEST_MESSAGE, 259.0).result == 0
+    information = station.heard[0]
+    assert information.flags & mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
+    assert bytes(information.model_name).rstrip(b"\0") == b"map camera"
+    assert station.send(mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION, 1.0).result == 0
+    assert station.heard[0].get_type() == "VIDEO_STREAM_INFORMATION"
+    assert station.send(POINT, 1.5, math.nan).result == mavlink.MAV_RESULT_DENIED
+    corners = (0.1, 0.2, 0.3, 0.4)
+    assert station.send(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *corners).result == 0
+    assert [(r.kind, r.coordinates) for r in station.asked] == [("rectangle", corners)]
+    others: Any = SimpleNamespace(target_component=1)
+    assert not station.camera.command(others, SECOND, 0, lambda *_: True)
 
 
 def test_one_target_is_told_the_one_clicked_last_and_idle_only_when_it_ends():

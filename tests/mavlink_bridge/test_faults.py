@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,10 +16,19 @@ from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
+from mavlink_bridge.flight_controller import FC_WANTED
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
-from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
+from tests.mavlink_bridge.simulated import (
+    HOME,
+    MS,
+    SECOND,
+    Flight,
+    SimulatedLink,
+    frame_of,
+    lengths,
+)
 
 LATE = (AlertId.FIXES_LATE, AlertId.FIXES_OVER_LIMIT)
 
@@ -33,16 +41,16 @@ def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
     return it
 
 
-def test_five_minutes_without_a_link(flight: Flight) -> None:
+def test_two_minutes_without_a_link(flight: Flight) -> None:
     """The localizer jumps meanwhile: the first message after it carries the jump and says so."""
     before = flight.vision()[-1][1]
     assert before.reset_counter == 0
     flight.link.open = False
-    flight.run(100.0)
+    flight.run(40.0)
     flight.north_m, flight.ekf_north_m, flight.reset_count = 25.0, 25.0, 1
-    flight.run(200.0)
+    flight.run(80.0)
     lost_ns = flight.now_ns
-    assert max(flight.queue_lengths().values()) <= 256
+    assert flight.longest() <= 512
     flight.link.open = True
     flight.run(10.0)
     after = flight.vision(lost_ns)
@@ -55,7 +63,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     assert flight.end.counters["reboots"] == 0
     # Only what is fresh: nothing that waited during the loss.
     assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
-    assert max(flight.queue_lengths().values()) <= 256
+    assert flight.longest() <= 512
     flight.reboot()
     flight.run(10.0)
     assert not flight.told(AlertId.TIMESYNC_UNANSWERED)  # a link that was gone owes no answers
@@ -91,26 +99,11 @@ def test_reboot_in_flight(flight: Flight) -> None:
     assert flight.attitude_error() < 0.005
 
 
-def test_only_a_gap_of_a_second_is_told(flight: Flight) -> None:
-    """A busy computer drops a few fixes now and then: nobody wants two texts for each."""
-
-    def blind(seconds: float) -> list[AlertId]:
-        before = len(flight.alerts)
-        withheld = flight.end.sender.injector.counters["withheld_stale"]
-        flight.sees = False
-        flight.run(seconds)
-        flight.sees = True
-        flight.run(2.0)
-        assert flight.end.sender.injector.counters["withheld_stale"] > withheld
-        news = [a.id for a in flight.alerts[before:]]
-        return [of for of in news if of in (AlertId.NO_FRESH_FIX, AlertId.INJECTING)]
-
-    assert blind(0.8) == []
-    assert blind(3.0) == [AlertId.NO_FRESH_FIX, AlertId.INJECTING]
-
-
 def test_a_clock_that_is_not_compared_any_more_is_told(flight: Flight) -> None:
     """Two crystals part by up to 0.2 ms a second: after ten minutes a fix is 1 m late."""
+    flight.say(mavlink.MAVLink_timesync_message(0, 123456789))
+    answer = flight.link.sent[-1][1]
+    assert (answer.tc1, answer.ts1) == (flight.now_ns, 123456789)  # its own question
     flight.run(20.0)
     flight.answers_timesync = False
     flight.run(14.0)
@@ -137,20 +130,6 @@ def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
     assert flight.end.counters["reboots"] == (1 if step_s < -1.0 else 0)
 
 
-@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
-def test_step_of_our_wall_clock_is_in_no_stamp(monkeypatch, step_s):
-    gps = InjectionConfig(message="gps_input", rate_hz=10, delay_ms=100)
-    flight = Flight(monkeypatch, injection=gps)
-    flight.run(10.0)
-    real = time.time_ns
-    monkeypatch.setattr("time.time_ns", lambda: real() + int(step_s * SECOND))
-    flight.run(5.0)
-    times = [m.time_week * 604_800_000 + m.time_week_ms for _, m in flight.vision()]
-    gaps = [b - a for a, b in itertools.pairwise(times)]
-    assert len(gaps) > 80
-    assert all(50 <= gap <= 200 for gap in gaps)
-
-
 def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
     for i in range(300):
         flight.north_m, flight.reset_count = float(i % 7), i + 1
@@ -162,14 +141,6 @@ def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
     jumps = [(a, b) for a, b in itertools.pairwise(messages) if abs(a.x - b.x) > 0.5]
     assert len(jumps) > 290
     assert all((a.reset_counter + 1) % 256 == b.reset_counter for a, b in jumps)
-
-
-def test_no_position_from_an_origin_on_another_continent(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = Flight(monkeypatch, origin=None)
-    flight.origin = (HOME[0], -HOME[1] - 60.0, 480.0)
-    flight.run(15.0)
-    assert flight.vision() == []
-    assert flight.told(AlertId.EKF_ORIGIN_FAR)
 
 
 def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(monkeypatch):
@@ -204,12 +175,12 @@ def test_a_latency_text_never_names_a_figure_within_its_limit(monkeypatch):
 def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer at its limit is late and in time by turns: three texts a minute say no more."""
     flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=100))
-    for latency_ms in (120, 80, 120, 80, 120, 80, 120):
+    for latency_ms in (120, 80, 120, 80, 120):
         flight.latency_ms = latency_ms
         flight.run(8.0)
     assert len(flight.told(*LATE)) == 1
     flight.latency_ms = 80
-    flight.run(90.0)
+    flight.run(30.0)
     assert flight.alerts[-1].id is AlertId.FIXES_IN_TIME
 
 
@@ -250,10 +221,9 @@ def damage(rng: random.Random, share: float) -> Callable[[bytes], bytes]:
     return mangle
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_damaged_frames_on_the_flight_controllers_link(monkeypatch, seed):
+def test_damaged_frames_on_the_flight_controllers_link(monkeypatch):
     flight = Flight(monkeypatch)
-    flight.mangle = damage(random.Random(seed), 0.3)
+    flight.mangle = damage(random.Random(0), 0.3)
     flight.run(90.0)
     counters = flight.reader.counters
     assert counters.bad_bytes > 1000
@@ -263,41 +233,28 @@ def test_damaged_frames_on_the_flight_controllers_link(monkeypatch, seed):
     assert not flight.told(AlertId.DUPLICATE_SYSTEM_ID)
     assert {m.reset_counter for _, m in flight.vision()} == {0}
     assert len(flight.vision(flight.now_ns - 60 * SECOND)) > 550
-    assert max(flight.queue_lengths().values()) < 1024
+    assert flight.longest() <= 512
 
 
 def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
     """Frames with right checksums and random contents, of every message that is listened to."""
-    names = sorted(
-        {"COMMAND_LONG", "COMMAND_INT", "COMMAND_ACK", "TIMESYNC", "GPS_GLOBAL_ORIGIN"}
-        | {"HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "STATUSTEXT"}
-        | {"GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_STATUS", "MOUNT_ORIENTATION", "GPS_RAW_INT"}
-        | {"GLOBAL_POSITION_INT", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "RC_CHANNELS"}
-        | {"AUTOPILOT_VERSION"}
-    )
+    kinds = [mavlink.mavlink_map[number] for number in sorted(FC_WANTED)]
     reader = FrameReader()
-    kinds = {kind.msgname: (number, kind) for number, kind in mavlink.mavlink_map.items()}
     for _ in range(count):
-        number, kind = kinds[rng.choice(names)]
-        payload = rng.randbytes(kind.unpacker.size)
-        system, component = rng.choice([(1, 1), (1, 1), (255, 190), (0, 0), (2, 1), (1, 197)])
-        header = bytes([0xFD, len(payload), 0, 0, 0, system, component])
-        header += number.to_bytes(3, "little")
-        crc = mavlink.x25crc(header[1:] + payload)
-        crc.accumulate(bytes([kind.crc_extra]))
-        yield from reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
+        kind = rng.choice(kinds)
+        sender = rng.choice([(1, 1), (1, 1), (255, 190), (0, 0), (2, 1), (1, 197)])
+        yield from reader.feed(frame_of(kind, rng.randbytes(kind.unpacker.size), *sender))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight, seed):
+def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight):
     ground, link = GroundEnd(flight.shared), SimulatedLink(system_id=1)
-    for i, message in enumerate(nonsense(random.Random(seed), 4000)):
+    for i, message in enumerate(nonsense(random.Random(0), 4000)):
         flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
         ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
         if i % 40 == 0:
             flight.run(0.05)
             ground.on_tick(link, flight.now_ns)  # type: ignore[arg-type]
-    assert max(flight.queue_lengths().values()) < 1024
+    assert flight.longest() <= 512
     # Even a lying autopilot is believed again once it speaks the truth.
     flight.reboot()
     flight.run(30.0)
@@ -307,7 +264,7 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(flight,
     assert math.isfinite(at.yaw_rad)
 
 
-@pytest.mark.parametrize("jumps", [1, 2, 3])
+@pytest.mark.parametrize("jumps", [1, 2])
 def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(monkeypatch, jumps):
     """Each process begins with a jump and counted from 0: ArduPilot had seen a 1 last, and fought
     the place that was found after the gap.
@@ -458,7 +415,7 @@ def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> No
     hour = 3600 * SECOND
     flight.end.components.queue_item(TargetReport(flight.now_ns + hour, *HOME, 500.0))
     flight.run(1.0)
-    assert flight.queue_lengths()["targets"] == 0
+    assert not lengths(flight.end)["targets"]
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
 
 

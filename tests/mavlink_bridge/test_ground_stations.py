@@ -1,6 +1,5 @@
 """What ground stations are shown beside the camera protocol: CoT, marks, figures, texts, video."""
 
-import contextlib
 import json
 import math
 import socket
@@ -61,6 +60,8 @@ def test_every_event_passes_the_published_schema_and_a_broken_one_does_not():
     ]  # fmt: skip
     for event in events:
         schema.assertValid(etree.fromstring(event))
+    remarks = [etree.fromstring(event).findtext("detail/remarks") for event in events]
+    assert remarks == ["20% likely on another surface (edge in the picture)", None, None, None]
     for broken in (b'lat="-33', b'stale="2', b'version="2.0"'):
         assert broken in events[0]
         wrong = events[0].replace(
@@ -216,33 +217,12 @@ def test_a_video_is_announced_as_stations_open_it(uri, kind, told):
     assert not camera_information(CameraConfig(), 0).flags & has_video
 
 
-class ForeignFilter:
-    """As MAVProxy reads STATUSTEXT: of the target system's target component (1) and no other."""
-
-    def __init__(self):
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.socket.settimeout(0.05)
-        self.port = self.socket.getsockname()[1]
-        self.heard = []
-        self._codec = mavlink.MAVLink(None, 255, 230)
-
-    def listen(self):
-        with contextlib.suppress(TimeoutError):
-            self.heard += self._codec.parse_buffer(self.socket.recv(4096)) or []
-        return self.heard
-
-    def shown(self):
-        texts = [m for m in self.listen() if m.get_type() == "STATUSTEXT"]
-        return [m.text for m in texts if (m.get_srcSystem(), m.get_srcComponent()) == (1, 1)]
-
-
 @pytest.mark.parametrize("as_autopilot", [False, True])
-def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_autopilot):
-    station = ForeignFilter()
+def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, ground, as_autopilot):
+    """As MAVProxy reads STATUSTEXT: of the target system's target component (1) and no other."""
     config = BridgeConfig(
         connection="udpin:127.0.0.1:0",
-        ground_connection=f"udpout:127.0.0.1:{station.port}",
+        ground_connection=f"udpout:127.0.0.1:{ground.port}",
         texts_as_autopilot=as_autopilot,
         named_values=True,
     )
@@ -250,21 +230,18 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
         assert sleep_until(lambda: bridge.port is not None, 30.0)
         autopilot.peer = ("127.0.0.1", bridge.port)
         assert sleep_until(lambda: bridge.state().connected, 30.0)
-        assert sleep_until(lambda: bool(station.listen()), 30.0)  # its link knows whose it is
+        assert sleep_until(lambda: bool(ground.received), 30.0)  # its link knows whose it is
         bridge.report_alert(alert(AlertId.FC_LOST))
         bridge.report_alert(alert(AlertId.FC_BACK))
         bridge.send_named_values({"VPS_SIGNAL": 2.0, "VPS_AGE": 0.25})
-
-        def figures():
-            named = [m for m in station.listen() if m.get_type() == "NAMED_VALUE_FLOAT"]
-            return {(m.name, m.get_srcComponent()): m.value for m in named}
-
-        assert sleep_until(lambda: len(figures()) == 2, 30.0)
-        assert figures() == {("VPS_SIGNAL", 191): 2.0, ("VPS_AGE", 191): 0.25}
-        assert station.shown() == ([text(alert(AlertId.FC_LOST))] if as_autopilot else [])
+        assert sleep_until(lambda: len(ground.of("NAMED_VALUE_FLOAT")) == 2, 30.0)
+        figures = [(m.name, m.value, m.get_srcComponent()) for m in ground.of("NAMED_VALUE_FLOAT")]
+        assert figures == [("VPS_SIGNAL", 2.0, 191), ("VPS_AGE", 0.25, 191)]
+        sources = [(m.text, m.get_srcComponent() == 1) for m in ground.of("STATUSTEXT")]
+        told = (AlertId.FC_LOST, as_autopilot), (AlertId.FC_BACK, False)
+        assert sources[-2:] == [(text(alert(of)), shown) for of, shown in told]
         with pytest.raises(ValueError, match="10 characters"):
             bridge.send_named_values({"VPS_SIGNALS": 1.0})
-    station.socket.close()
 
 
 def test_the_buttons_for_qgroundcontrol_are_commands_that_our_components_take():

@@ -1,4 +1,4 @@
-"""What PX4 receives, decoded from the bytes by hand: the fields, ids and units of common.xml.
+"""What PX4 receives: the fields, ids and units of common.xml.
 
 The meanings are those of PX4's documentation and receiver: position and velocity variances on the
 diagonal, NED frame, FRD body velocity, exposure stamps that TIMESYNC maps.
@@ -7,12 +7,10 @@ diagonal, NED frame, FRD body velocity, exposure stamps that TIMESYNC maps.
 from __future__ import annotations
 
 import math
-import struct
 from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig
@@ -24,36 +22,10 @@ from mavlink_bridge.preflight.doctor import check_parameters
 from mavlink_bridge.preflight.rules import px4_rules
 from mavlink_bridge.quaternion import from_euler
 from mavlink_bridge.vehicle.profile import PX4
+from tests.mavlink_bridge.simulated import GEOID, HOME, MS, SECOND
 
-MS = 1_000_000
-SECOND = 1_000 * MS
-HOME = (47.397742, 8.545594)
-GEOID = 47.0
 YAW = math.radians(90.0)
 P = np.array([[0.25, 0.05, 0.01], [0.05, 0.36, 0.02], [0.01, 0.02, 0.49]])
-
-
-def crc(data: bytes, extra: int) -> int:
-    """X.25 (CRC-16/MCRF4XX) of the frame behind its marker and the message's own byte."""
-    value = 0xFFFF
-    for byte in (*data, extra):
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ 0x8408 if value & 1 else value >> 1
-    return value
-
-
-def payload(message: Any, message_id: int, extra: int, length: int) -> bytes:
-    """The payload of the packed frame, zeros that MAVLink 2 cuts off put back."""
-    frame = bytes(message.pack(mavlink.MAVLink(None, 1, 197)))
-    marker, size, incompatible, _, _, system, component = frame[:7]
-    assert (marker, incompatible, system, component) == (0xFD, 0, 1, 197)
-    assert int.from_bytes(frame[7:10], "little") == message_id
-    assert int.from_bytes(frame[10 + size : 12 + size], "little") == crc(
-        frame[1 : 10 + size], extra
-    )
-    assert len(frame) == 12 + size
-    return frame[10 : 10 + size].ljust(length, b"\0")
 
 
 def injected(kind: Any, sent_ns: int = 10 * SECOND + 80 * MS) -> Any:
@@ -84,51 +56,42 @@ def injected(kind: Any, sent_ns: int = 10 * SECOND + 80 * MS) -> Any:
 
 
 def test_vision_position_estimate() -> None:
-    raw = payload(injected("vision_position_estimate"), 102, 158, 117)
-    usec, x, y, z, roll, pitch, yaw = struct.unpack_from("<Q6f", raw)
-    covariance = struct.unpack_from("<21f", raw, 32)
-    assert usec == 10_000_000
-    assert (x, y, z) == pytest.approx((100.0, 0.0, -60.0), abs=0.01)
-    assert (roll, pitch, yaw) == pytest.approx((0.0, 0.0, YAW), abs=1e-6)
-    diagonal = [covariance[i] for i in (0, 6, 11, 15, 18, 20)]
+    m = injected("vision_position_estimate")
+    assert (m.get_msgId(), m.crc_extra) == (102, 158)  # of common.xml
+    assert m.usec == 10_000_000
+    assert (m.x, m.y, m.z) == pytest.approx((100.0, 0.0, -60.0), abs=0.01)
+    assert (m.roll, m.pitch, m.yaw) == pytest.approx((0.0, 0.0, YAW), abs=1e-6)
+    diagonal = [m.covariance[i] for i in (0, 6, 11, 15, 18, 20)]
     assert diagonal == pytest.approx([0.25, 0.36, 0.49, 9e-4, 9e-4, 9e-4], rel=1e-3)
-    assert [covariance[i] for i in (1, 2, 7)] == pytest.approx([0.05, 0.01, 0.02], rel=1e-5)
-    assert raw[116] == 0  # reset_counter
+    assert [m.covariance[i] for i in (1, 2, 7)] == pytest.approx([0.05, 0.01, 0.02], rel=1e-5)
+    assert m.reset_counter == 0
 
 
 def test_odometry() -> None:
-    raw = payload(injected("odometry"), 331, 91, 233)
-    usec, x, y, z = struct.unpack_from("<Q3f", raw)
-    q = struct.unpack_from("<4f", raw, 20)
-    velocity = struct.unpack_from("<3f", raw, 36)
-    rates = struct.unpack_from("<3f", raw, 48)
-    pose = struct.unpack_from("<21f", raw, 60)
-    twist = struct.unpack_from("<21f", raw, 144)
-    frame, child, reset, estimator, quality = struct.unpack_from("<4Bb", raw, 228)
-    assert usec == 10_000_000
-    assert (x, y, z) == pytest.approx((100.0, 0.0, -60.0), abs=0.01)
-    assert q == pytest.approx((math.cos(YAW / 2), 0.0, 0.0, math.sin(YAW / 2)), abs=1e-6)
+    m = injected("odometry")
+    assert (m.get_msgId(), m.crc_extra) == (331, 91)
+    assert m.time_usec == 10_000_000
+    assert (m.x, m.y, m.z) == pytest.approx((100.0, 0.0, -60.0), abs=0.01)
+    assert m.q == pytest.approx((math.cos(YAW / 2), 0.0, 0.0, math.sin(YAW / 2)), abs=1e-6)
     # Nose to the east, flying east and climbing: forward and up.
-    assert velocity == pytest.approx((12.0, 0.0, -1.0), abs=1e-5)
-    assert all(math.isnan(rate) for rate in rates)
-    assert [pose[i] for i in (0, 6, 11)] == pytest.approx([0.25, 0.36, 0.49], rel=1e-3)
-    assert [twist[i] for i in (0, 6, 11)] == pytest.approx([0.04] * 3, rel=1e-3)
-    assert (frame, child) == (1, 12)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_FRD
-    assert (reset, estimator, quality) == (0, 2, 77)  # MAV_ESTIMATOR_TYPE_VISION
+    assert (m.vx, m.vy, m.vz) == pytest.approx((12.0, 0.0, -1.0), abs=1e-5)
+    assert all(math.isnan(rate) for rate in (m.rollspeed, m.pitchspeed, m.yawspeed))
+    assert [m.pose_covariance[i] for i in (0, 6, 11)] == pytest.approx([0.25, 0.36, 0.49], rel=1e-3)
+    assert [m.velocity_covariance[i] for i in (0, 6, 11)] == pytest.approx([0.04] * 3, rel=1e-3)
+    assert (m.frame_id, m.child_frame_id) == (1, 12)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_FRD
+    assert (m.reset_counter, m.estimator_type, m.quality) == (0, 2, 77)  # of vision
 
 
 def test_global_position_sensor_says_when_it_was_sent_and_how_old_it_is() -> None:
-    raw = payload(injected("global_position_sensor"), 296, 158, 41)
-    usec, age, lat, lon, ellipsoid, amsl, eph, epv = struct.unpack_from("<QIii4f", raw)
-    system, component, sensor, source, flags = struct.unpack_from("<5B", raw, 36)
-    assert usec == 10_080_000
-    assert age == 80_000
-    assert lat == round((HOME[0] + math.degrees(100.0 / 6371000.0)) * 1e7)
-    assert lon == round(HOME[1] * 1e7)
-    assert (ellipsoid, amsl) == pytest.approx((595.0, 548.0), abs=1e-3)
-    assert eph == pytest.approx(math.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1]), rel=1e-3)
-    assert epv == pytest.approx(0.7, rel=1e-3)
-    assert (system, component, sensor, source, flags) == (0, 0, 1, 2, 0)
+    m = injected("global_position_sensor")
+    assert (m.get_msgId(), m.crc_extra) == (296, 158)
+    assert (m.time_usec, m.processing_time) == (10_080_000, 80_000)
+    assert m.lat == round((HOME[0] + math.degrees(100.0 / 6371000.0)) * 1e7)
+    assert m.lon == round(HOME[1] * 1e7)
+    assert (m.alt_ellipsoid, m.alt) == pytest.approx((595.0, 548.0), abs=1e-3)
+    assert m.eph == pytest.approx(math.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1]), rel=1e-3)
+    assert m.epv == pytest.approx(0.7, rel=1e-3)
+    assert (m.id, m.source, m.flags) == (1, 2, 0)
 
 
 def rules(message: Any, parameters: dict[str, float]) -> dict[str, float | None]:

@@ -27,9 +27,9 @@ from mavlink_bridge.injection.encode import (
 )
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.messages import CameraView, Origin, TargetReport
-from mavlink_bridge.vehicle.origin import OriginKeeper
 from mavlink_bridge.vehicle.readings import VehicleReadings
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+from tests.mavlink_bridge.simulated import exchanging
 
 # How many of a unit make one degree, metre, m/s, radian or second.
 PER = {
@@ -129,18 +129,18 @@ def test_what_is_sent_is_in_the_units_of_the_definition(message, values):
 
 
 def test_the_origin_is_set_and_read_in_the_units_of_the_definition() -> None:
-    keeper = OriginKeeper(OriginConfig(latitude_deg=LAT, longitude_deg=LON, altitude_amsl_m=AMSL))
-    sent = next(
-        m for k in range(9) if (m := keeper.tick(k * 10**10, 1, lambda _: None)) is not None
-    )
+    configured = OriginConfig(latitude_deg=LAT, longitude_deg=LON, altitude_amsl_m=AMSL)
+    exchange, link, _ = exchanging(configured)
+    for k in range(9):
+        exchange.tick(link, k * 10**10, may_set=True)
+    message = next(m for _, m, _ in link.sent if m.get_type() == "SET_GPS_GLOBAL_ORIGIN")
     wanted = {"latitude": LAT, "longitude": LON, "altitude": AMSL}
     for field, value in wanted.items():
-        assert getattr(sent, field) == round(scaled(kind_of(sent), field, value))
+        assert getattr(message, field) == round(scaled(kind_of(message), field, value))
     kind = mavlink.mavlink_map[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN]
-    keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(
-        *(round(scaled(kind, field, value)) for field, value in wanted.items()), 0
-    ), armed=False)  # fmt: skip
-    assert keeper.origin == Origin(*map(pytest.approx, (LAT, LON, AMSL)))
+    fields = (round(scaled(kind, field, value)) for field, value in wanted.items())
+    exchange.on_message(mavlink.MAVLink_gps_global_origin_message(*fields, 0), 0)
+    assert exchange.origin == Origin(*map(pytest.approx, (LAT, LON, AMSL)))
 
 
 def read(name: str, values: dict[str, float], **others: Any) -> VehicleTracker:

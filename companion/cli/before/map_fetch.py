@@ -220,9 +220,9 @@ def _planned(
     source: CatalogueSource, area: Area, resolution: float, most_mb: float, work: Path, role: str
 ) -> _Part:
     from localizer.map.fetch.fetch import make_plan
-    from localizer.map.fetch.http_client import HttpClient, RequestLimits
+    from localizer.map.fetch.http_client import HttpClient
 
-    client = HttpClient(RequestLimits(source.rate_per_s, round(most_mb * _MB)))
+    client = HttpClient(source.rate_per_s, round(most_mb * _MB))
     wanted = source.resolution_m if source.has_heights else max(source.resolution_m, resolution)
     plan = make_plan(source, area, wanted, client)
     return _Part(source, plan, client, work / f"{role}-pieces", work / f"{role}.tif")

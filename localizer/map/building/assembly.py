@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -13,7 +14,7 @@ from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.map.building.staging import Staging, StoredTile, TileRecord
-from localizer.map.cache.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
+from localizer.map.cache.cache import ADD, REPLACE, TileIndex, tile_name
 from localizer.map.source import SourceNode, SourceTree
 
 
@@ -69,12 +70,13 @@ def _covers(node: _Node) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """A cache before publishing. manifest: with the fields that the tiles determine; leaves: the
-    finest tiles; volumes: ECEF corners (8, 3) that the source states for nodes, with their tiles.
+    """A cache before publishing. figures: fields of the `Manifest` that the tiles determine;
+    leaves: the finest tiles; volumes: ECEF corners (8, 3) that the source states for nodes, with
+    their tiles.
     """
 
     index: TileIndex
-    manifest: Manifest
+    figures: dict[str, Any]
     leaves: list[StoredTile]
     volumes: list[tuple[Array, list[StoredTile]]]
 
@@ -116,7 +118,7 @@ def assemble(
     )
     return Assembled(
         index,
-        _manifest(nodes, child_start, tiles, frame),
+        _figures(nodes, child_start, tiles, frame),
         [tile for node in nodes if not node.children for tile in node.tiles],
         [(n.source.corners, n.tiles) for n in nodes if n.source.corners is not None and n.tiles],
     )
@@ -150,9 +152,9 @@ def _tile_transforms(tiles: list[StoredTile], frame: LocalFrame) -> Array:
     return transforms
 
 
-def _manifest(
+def _figures(
     nodes: list[_Node], child_start: list[int], tiles: list[StoredTile], frame: LocalFrame
-) -> Manifest:
+) -> dict[str, Any]:
     depth = np.ones(len(nodes), int)
     for i, node in enumerate(nodes):
         depth[child_start[i] : child_start[i] + len(node.children)] = depth[i] + 1
@@ -170,20 +172,12 @@ def _manifest(
     flat = np.column_stack([outline, np.zeros(len(outline))])
     geodetic = frame.geodetic_from_enu(flat)
     heights = frame.geodetic_from_enu(corners)[:, 2]
-    return Manifest(
-        origin=frame.origin,
-        vertical_datum="ellipsoidal",
-        geoid_separation_m=0.0,
-        source="",
-        attribution="",
-        gsd_m=float(np.median(gsd)) if gsd else 0.0,
-        levels=int(depth.max()),
-        tiles=len(tiles),
-        triangles=sum(t.triangles for t in leaves),
-        bytes=sum(t.file_bytes for t in tiles),
-        extent=tuple((float(lat), float(lon)) for lat, lon, _ in geodetic),
-        height_range_m=(float(heights.min()), float(heights.max())),
-        build={},
-        skipped={},
-        index_sha256="",
-    )
+    return {
+        "gsd_m": float(np.median(gsd)) if gsd else 0.0,
+        "levels": int(depth.max()),
+        "tiles": len(tiles),
+        "triangles": sum(t.triangles for t in leaves),
+        "bytes": sum(t.file_bytes for t in tiles),
+        "extent": tuple((float(lat), float(lon)) for lat, lon, _ in geodetic),
+        "height_range_m": (float(heights.min()), float(heights.max())),
+    }

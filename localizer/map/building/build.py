@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,18 +12,21 @@ import numpy as np
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.assembly import assemble
-from localizer.map.building.content import require_in_volumes, require_upright
-from localizer.map.building.heights import extent_warnings, heights_of
+from localizer.map.building.content import (
+    extent_warnings,
+    heights_of,
+    require_in_volumes,
+    require_upright,
+)
 from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
 from localizer.map.building.sources import find_source, read_source
 from localizer.map.building.staging import TileRecord, publish, staging, write_index
-from localizer.map.building.workers import ImportJob, ImportWorkers, Progress, import_all, tiles_of
+from localizer.map.building.workers import ImportJob, Progress, import_all, tiles_of
 from localizer.map.cache.cache import Manifest
-from localizer.map.importers.georeference import Georeference
 from localizer.map.inspection.kind import measure_kind
 from localizer.map.kind import IMAGERY_DATE
-from localizer.map.source import FlatTree, SourceNode, SourceTree
+from localizer.map.source import SourceNode, SourceTree
 
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 
@@ -54,19 +56,12 @@ def build_cache(
     named = name or " ".join(map(str, sources))
     if options.is_apart:
         what = f"{named}: its reading"
-        flat = call_in_process(
-            _read_flat, sources, georeference, options, rules=options.rules, what=what
+        tree = call_in_process(
+            read_source, sources, georeference, options, rules=options.rules, what=what
         )
-        tree = flat.tree()
     else:
         tree = read_source(sources, georeference, options)
     return build_tree(tree, out, named, options, progress=progress)
-
-
-def _read_flat(
-    sources: Sequence[Path], georeference: Georeference | Path | None, options: BuildOptions
-) -> FlatTree:
-    return FlatTree.of(read_source(sources, georeference, options))
 
 
 def build_tree(
@@ -98,34 +93,27 @@ def build_tree(
     }
     with staging(Path(out), parameters, overwrite=options.overwrite) as staged:
         job = ImportJob(staged, frame, lift, rules)
-        how = ImportWorkers(
-            options.workers or os.cpu_count() or 1,
-            apart=options.is_apart,
-            scheduler=options.scheduler,
-        )
-        records = import_all(tree.root, job, how, progress or (lambda _done, _total: None))
+        records = import_all(tree.root, job, options, progress or (lambda _done, _total: None))
         skipped = _failures(tree.root, records)
         if skipped and not options.skip_bad_tiles:
             raise MapSourceError(_failure_text(name, skipped))
         built = assemble(tree, records, staged, frame)
-        manifest = built.manifest
         doubts += require_upright(built.leaves, tree.up_axis, name, rules)
         doubts += require_in_volumes(built.volumes, frame, lift, name, rules)
         doubts += extent_warnings(
-            manifest.extent, manifest.height_range_m, separation, name, rules
-        )  # fmt: skip
-        manifest = manifest.model_copy(
-            update={
-                "vertical_datum": datum,
-                "geoid_separation_m": separation,
-                "source": name,
-                "attribution": (
-                    tree.attribution if options.attribution is None else options.attribution
-                ),
-                "build": parameters,
-                "skipped": skipped,
-                "warnings": (*tree.warnings, *doubts),
-            }
+            built.figures["extent"], built.figures["height_range_m"], separation, name, rules
+        )
+        manifest = Manifest(
+            origin=frame.origin,
+            vertical_datum=datum,
+            geoid_separation_m=separation,
+            source=name,
+            attribution=tree.attribution if options.attribution is None else options.attribution,
+            build=parameters,
+            skipped=skipped,
+            warnings=(*tree.warnings, *doubts),
+            index_sha256="",
+            **built.figures,
         )
         cache = write_index(staged, built.index, manifest)
         kind = measure_kind(

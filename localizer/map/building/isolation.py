@@ -7,6 +7,7 @@ import multiprocessing.connection
 import os
 import resource
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -17,6 +18,7 @@ from localizer.map.importers.rules import ImportRules
 
 _Result = TypeVar("_Result")
 _PAGE = resource.getpagesize()
+_NESTED = 10_000  # calls that pickle makes of a tile tree, which may be 300 levels deep
 # Formats that fetch from the network or start other programs; read when GDAL first registers its
 # drivers, so before that.
 _NO_DRIVERS = "HTTP,WMS,WCS,WMTS,WFS,OAPIF,OGCAPI,DAAS,EEDAI,PLMOSAIC,STACTA,STACIT,NGW,PLSCENES"
@@ -70,6 +72,7 @@ def _answer(
     there: Connection, rules: ImportRules, function: Callable[..., Any], args: tuple[object, ...]
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    sys.setrecursionlimit(_NESTED)
     confine(rules)
     try:
         answer: tuple[bool, Any] = True, function(*args)

@@ -89,11 +89,7 @@ def mesh_tree(path: Path, georeference: Georeference, options: BuildOptions) -> 
     files = (path, *files_beside(path))
     doubts = obj_materials(path)[1] if path.suffix.lower() == ".obj" else ()
     warnings = [f"{path.name}: {text}" for text in doubts]
-    text = georeference.far_outside(np.array([low, high]))
-    if text is not None:
-        warnings.append(options.rules.accept("area", f"{path}: {text}"))
-    elif (unsure := georeference.datum_doubt(np.array([low, high]))) is not None:
-        warnings.append(f"{path.name}: {unsure}")
+    warnings += georeference.doubts(np.array([low, high]), path, options.rules)
     if georeference.unread:
         warnings.append(
             f"{path.name}: not read of its georeference: {', '.join(georeference.unread)}"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ import numpy as np
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
 from localizer.map.building.isolation import call_in_process, confine, out_of_memory
+from localizer.map.building.options import BuildOptions
 from localizer.map.building.staging import Staging, TileRecord
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
@@ -70,17 +72,6 @@ class ImportJob:
         return replace(mesh, positions=enu)
 
 
-@dataclass(frozen=True)
-class ImportWorkers:
-    """Processes of an import. count: number; apart: use separate processes even for one; scheduler:
-    address of a Dask scheduler instead.
-    """
-
-    count: int
-    apart: bool = True
-    scheduler: str | None = None
-
-
 def tiles_of(root: SourceNode) -> Iterator[TileSource]:
     """Yield every tile of a tree in numbering order."""
     for node in root.walk():
@@ -88,11 +79,12 @@ def tiles_of(root: SourceNode) -> Iterator[TileSource]:
 
 
 def import_all(
-    root: SourceNode, job: ImportJob, workers: ImportWorkers, progress: Progress
+    root: SourceNode, job: ImportJob, options: BuildOptions, progress: Progress
 ) -> dict[int, TileRecord]:
     """Records of every source tile, by its place in `tiles_of` order. Tiles that an interrupted
-    build imported are not imported again. progress: called in the caller's thread with the number
-    of finished tiles and of all tiles. `MapSourceError` if no tile has content.
+    build imported are not imported again. options: its processes. progress: called in the caller's
+    thread with the number of finished tiles and of all tiles. `MapSourceError` if no tile has
+    content.
     """
     records: dict[int, TileRecord] = {}
     todo: list[tuple[int, TileSource]] = []
@@ -106,21 +98,16 @@ def import_all(
         raise MapSourceError("the source has no tile with content")
     total = len(records) + len(todo)
     progress(len(records), total)
-    if workers.scheduler is not None:
-        run = _run_dask(job, todo, workers.scheduler)
+    if options.scheduler is not None:
+        run = _run_dask(job, todo, options.scheduler)
+    elif options.is_apart:
+        run = _run_pool(job, todo, options.workers or os.cpu_count() or 1)
     else:
-        run = _run_pool(job, todo, workers.count) if workers.apart else _run_here(job, todo)
+        run = (_numbered(job, key, tile) for key, tile in todo)
     for key, record in run:
         records[key] = record
         progress(len(records), total)
     return records
-
-
-def _run_here(
-    job: ImportJob, todo: Iterable[tuple[int, TileSource]]
-) -> Iterator[tuple[int, TileRecord]]:
-    for key, tile in todo:
-        yield key, job.run(key, tile)
 
 
 def _run_dask(
@@ -132,9 +119,8 @@ def _run_dask(
         raise MapSourceError(f"a Dask scheduler needs the package distributed: {error}") from error
     with Client(address) as client:
         queue = iter(todo)
-        room = 4 * max(
-            1, sum(client.nthreads().values())
-        )  # queued tiles, so that memory is bounded
+        # Few queued tiles, so that memory is bounded.
+        room = 4 * max(1, sum(client.nthreads().values()))
         running = as_completed(
             [client.submit(_numbered, job, *item, pure=False) for item in islice(queue, room)]
         )

@@ -11,7 +11,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +22,15 @@ from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache, read_manifest
-from localizer.map.cache.failed_nodes import FailedNodes
 from localizer.map.cache.hold import CacheLock
-from localizer.map.cache.resident_nodes import ResidentNodes
 from localizer.map.cache.select import DetailLimits, Selection, TileSelector
 from localizer.map.cache.tile import TileMesh
 
 _log = logging.getLogger(__name__)
 _CLOSE_S = 10.0  # for a tile to be read to its end
+# Limit of the new data of one selection, so that the upload does not slow the renderer; there is no
+# limit for a selection that waits.
+_BYTES_PER_SELECT = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -62,16 +64,13 @@ class TileStreamer:
         byte_budget: int = 512 << 20,
         max_error_px: float = DetailLimits.max_error_px,
         max_texel_px: float = DetailLimits.max_texel_px,
-        bytes_per_select: int = 64 << 20,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Start the loader thread and lock the cache, so that no build replaces it until `close`.
         MapCacheError if one has replaced it since it was opened.
 
         byte_budget: size limit of the decoded tiles. max_error_px, max_texel_px: see
-        `DetailLimits`. bytes_per_select: limit of the new data of one selection, so that the upload
-        does not slow the renderer; there is no limit for a selection that waits. clock: in seconds;
-        nodes that could not be read are tried again by it.
+        `DetailLimits`. clock: in seconds; nodes that could not be read are tried again by it.
         """
         self.cache = cache
         self._selector = TileSelector(cache.index, cache.frame)
@@ -85,7 +84,6 @@ class TileStreamer:
         self._ahead: list[int] = []  # after those
         self._arrived: list[tuple[int, list[TileMesh]]] = []  # loaded, not yet in use
         self._arrived_bytes = 0
-        self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
         self._closed = self._waiting = self.lacks_tiles = False
         self._hold = _held(cache)
@@ -102,7 +100,7 @@ class TileStreamer:
         """
         limits = self._fitting_limits(world_from_camera, camera)
         with self._lock:
-            self._take_in(None if wait else self._bytes_per_select)
+            self._take_in(None if wait else _BYTES_PER_SELECT)
             choice = self._choose(world_from_camera, camera, limits)
             while wait and not self._nodes.resident[choice.wanted].all():
                 missing = choice.wanted[~self._nodes.resident[choice.wanted]].tolist()
@@ -240,7 +238,7 @@ class TileStreamer:
 
     def _to_load(self) -> list[int]:
         """Nodes to load, in order; empty while there is no room for them."""
-        if self._arrived_bytes >= self._bytes_per_select:
+        if self._arrived_bytes >= _BYTES_PER_SELECT:
             return []
         return self._queue or self._ahead
 
@@ -286,3 +284,110 @@ def _node_bytes(cache: TileCache) -> NDArray[np.int64]:
     index = cache.index
     total = np.concatenate([[0], np.cumsum(index.size)])
     return np.asarray(total[index.tile_start + index.tile_count] - total[index.tile_start])
+
+
+_RETRY_S, _RETRY_MOST_S = 0.5, 30.0  # between attempts at a node that could not be read
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a node could not be read, how often in a row, and when it is tried again."""
+
+    error: MapCacheError
+    count: int
+    again_s: float
+
+
+class FailedNodes:
+    """Nodes that could not be read. Callers hold the streamer's lock. clock: returns seconds.
+    attempts: number of failures so far.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._failures: dict[int, _Failure] = {}
+        self.attempts = 0
+
+    def __len__(self) -> int:
+        return len(self._failures)
+
+    def add(self, node: int, error: MapCacheError) -> None:
+        """Record a failed read, and log a node's first; each further one delays its retry
+        longer.
+        """
+        before = self._failures.get(node)
+        if before is None:
+            _log.error("%s", error)
+        count = 1 if before is None else before.count + 1
+        wait_s = min(_RETRY_S * 2.0 ** min(count - 1, 10), _RETRY_MOST_S)
+        self._failures[node] = _Failure(error, count, self._clock() + wait_s)
+        self.attempts += 1
+
+    def remove(self, node: int) -> None:
+        """Forget a node's failures, because it was read."""
+        self._failures.pop(node, None)
+
+    def is_waiting(self, node: int) -> bool:
+        """Whether a node has failed and its retry is not due."""
+        failure = self._failures.get(node)
+        return failure is not None and self._clock() < failure.again_s
+
+    def check(self, node: int) -> None:
+        """Raise the node's `MapCacheError` while it is waiting."""
+        if self.is_waiting(node):
+            raise self._failures[node].error
+
+
+class ResidentNodes:
+    """Nodes in memory. Callers hold the streamer's lock.
+
+    sizes: bytes of each node (N,), whether in memory or not; resident: (N,), whether it is in
+    memory; bytes: sum of the nodes in memory. evicted: removed nodes that are not yet freed;
+    evictions: number of removals so far.
+    """
+
+    def __init__(self, sizes: NDArray[np.int64], budget: int) -> None:
+        self.sizes, self.budget = sizes, budget
+        self.resident = np.zeros(len(sizes), np.bool_)
+        self.bytes = self.evictions = 0
+        self.evicted: list[list[TileMesh]] = []
+        self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
+
+    def use(self, node: int) -> Sequence[TileMesh]:
+        """A resident node's meshes; marks the node as the most recently used."""
+        self._meshes.move_to_end(node)
+        return self._meshes[node]
+
+    def add(self, node: int, meshes: list[TileMesh], *, keep: Collection[int], beside: int) -> None:
+        """Add a node and evict others if necessary, but not those in `keep`, so that a view can
+        complete; the budget may then be exceeded. beside: further bytes in memory that count
+        against the budget.
+        """
+        size = int(self.sizes[node])
+        self._make_room(beside + size, keep)
+        self._meshes[node] = meshes
+        self.resident[node] = True
+        self.bytes += size
+
+    def take_evicted(self) -> list[list[TileMesh]]:
+        """The evicted nodes, to be freed where it delays nothing."""
+        taken, self.evicted = self.evicted, []
+        return taken
+
+    def clear(self) -> None:
+        """Drop all tiles."""
+        self._meshes.clear()
+        self.evicted.clear()
+        self.resident[:] = False
+        self.bytes = 0
+
+    def _make_room(self, needed: int, keep: Collection[int]) -> None:
+        for node in list(self._meshes):
+            if self.bytes + needed <= self.budget:
+                return
+            if node in keep:
+                continue
+            self.evicted.append(self._meshes.pop(node))
+            self.resident[node] = False
+            self.bytes -= int(self.sizes[node])
+            self.evictions += 1

@@ -101,14 +101,12 @@ class CatalogueSource(BaseModel):
         return (east - west) * (north - south)
 
 
-def load_sources(
-    more: tuple[Path, ...] = (), shipped: Path = SHIPPED
-) -> tuple[CatalogueSource, ...]:
+def load_sources(more: tuple[Path, ...] = ()) -> tuple[CatalogueSource, ...]:
     """Sources of the shipped file and of other files, which replace those of the same name.
     `MapFetchError` for invalid or forbidden ones.
     """
     found: dict[str, CatalogueSource] = {}
-    for path in (shipped, *more):
+    for path in (SHIPPED, *more):
         for entry in _entries(path):
             try:
                 source = CatalogueSource.model_validate(entry)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import io
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,14 +23,14 @@ from rasterio.io import MemoryFile
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
-from localizer.errors import MapFetchError
+from localizer.errors import GeoreferenceError, MapFetchError, MapSourceError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.heights import UNITS, metres_of
-from localizer.map.fetch.http_client import HttpClient, safe_url
+from localizer.map.fetch.http_client import HttpAnswer, HttpClient, safe_url
 from localizer.map.fetch.raster import FetchGrid, FetchPlan, Piece, grid_over, split_grid
-from localizer.map.importers.height_crs import flat_crs, utm_zone
-from localizer.map.importers.raster_file import offline
+from localizer.map.importers.height_crs import flat_crs, stated_heights, utm_zone
+from localizer.map.importers.raster_file import HeightBand, height_band, offline
+from localizer.map.importers.rules import DEFAULT_RULES
 
 NODATA = -32768.0
 _HEIGHT_BYTES, _PICTURE_BYTES = 3.0, 0.8
@@ -53,8 +53,8 @@ class RangeFile(io.RawIOBase):
         super().__init__()
         self._url, self._client, self._failed = url, client, failed
         self._at = 0
-        self._blocks: OrderedDict[int, bytes] = OrderedDict()
         self._size = 0
+        self._block = lru_cache(_KEPT_BLOCKS)(self._asked)
         self._block(0)
 
     def readable(self) -> bool:
@@ -90,38 +90,33 @@ class RangeFile(io.RawIOBase):
             self._at += len(part)
         return done
 
-    def _block(self, number: int) -> bytes:
-        if number in self._blocks:
-            self._blocks.move_to_end(number)
-            return self._blocks[number]
-        try:
-            data = self._asked(number)
-        except MapFetchError as error:
-            self._failed.append(error)
-            raise
-        self._blocks[number] = data
-        while len(self._blocks) > _KEPT_BLOCKS:
-            self._blocks.popitem(last=False)
-        return data
-
     def _asked(self, number: int) -> bytes:
         begin = number * _BLOCK
         asked = {"Range": f"bytes={begin}-{begin + _BLOCK - 1}"}
-        # Only at its begin: one that goes away in between is a fault of the server.
-        answer = self._client.get(self._url, asked, () if self._size else (_NOT_THERE,))
+        try:
+            # Only at its begin: one that goes away in between is a fault of the server.
+            answer = self._client.get(self._url, asked, () if self._size else (_NOT_THERE,))
+            self._require_part(answer)
+        except MapFetchError as error:
+            self._failed.append(error)
+            raise
+        return answer.data
+
+    def _require_part(self, answer: HttpAnswer) -> None:
+        """Check the answer to a request of a block; the first one tells the file's size."""
+        url = safe_url(self._url)
         if answer.status == _NOT_THERE:
-            raise NoFileError(f"{safe_url(self._url)}: status {_NOT_THERE}: there is no such file")
+            raise NoFileError(f"{url}: status {_NOT_THERE}: there is no such file")
         if answer.status != 206:
             raise MapFetchError(
-                f"{safe_url(self._url)}: the server gives whole files only (no HTTP ranges): "
-                "download it once and use `companion map build`"
+                f"{url}: the server gives whole files only (no HTTP ranges): download it once and "
+                "use `companion map build`"
             )
         if not self._size:
             total = answer.headers.get("content-range", "").rpartition("/")[2]
             if not total.isdigit():
-                raise MapFetchError(f"{safe_url(self._url)}: does not say how long the file is")
+                raise MapFetchError(f"{url}: does not say how long the file is")
             self._size = int(total)
-        return answer.data
 
 
 @dataclass(frozen=True)
@@ -276,23 +271,13 @@ def _of_file(
     source: CatalogueSource, window: FetchGrid, url: str, client: HttpClient
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """A window's bands (n, height, width) from one file, and the mask of known pixels."""
-    bands = 1 if source.has_heights else 3
-    how = Resampling.bilinear if source.has_heights else Resampling.average
     failed: list[MapFetchError] = []
     try:
-        with (
-            offline(),
-            _opened(url, client, failed) as data,
-            _warped(data, window, how, source) as vrt,
-        ):
+        with offline(), _opened(url, client, failed) as data:
             if not source.has_heights:
                 require_8_bits(safe_url(url), data.dtypes[0])
-            read = vrt.read(list(range(1, min(bands, data.count) + 1)))
-            if source.has_heights:
-                read = metres_of(source, _name(url), data, window.crs).metres(read)
-            return read.astype(np.float32 if source.has_heights else np.uint8), (
-                vrt.dataset_mask() > 0
-            )
+            read, known = warped(source, _name(url), data, window)
+            return read.astype(np.float32 if source.has_heights else np.uint8), known
     except RasterioError as error:
         raise MapFetchError(f"{safe_url(url)}: cannot be read: {error}") from error
     finally:
@@ -300,16 +285,27 @@ def _of_file(
             raise failed[0]
 
 
-def _warped(data: Any, window: FetchGrid, how: Resampling, source: CatalogueSource) -> WarpedVRT:
+def warped(
+    source: CatalogueSource, name: str, data: Any, window: FetchGrid
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """A window's bands (n, height, width), heights in metres, of a file opened by rasterio that has
+    a place, and the mask of known pixels.
+    """
     options: dict[str, Any] = {"src_crs": flat_crs(CRS(data.crs)).to_wkt()}
     if source.nodata is not None:
         options |= {"src_nodata": source.nodata, "nodata": source.nodata}
     elif data.nodata is None:
         options["add_alpha"] = True
-    return WarpedVRT(
-        data, crs=window.crs.to_wkt(), transform=window.transform,
-        width=window.width, height=window.height, resampling=how, tolerance=0.01, **options,
-    )  # fmt: skip
+    with WarpedVRT(
+        data, crs=window.crs.to_wkt(), transform=window.transform, width=window.width,
+        height=window.height, tolerance=0.01,
+        resampling=Resampling.bilinear if source.has_heights else Resampling.average, **options,
+    ) as vrt:  # fmt: skip
+        read = vrt.read(list(range(1, min(1 if source.has_heights else 3, data.count) + 1)))
+        known = vrt.dataset_mask() > 0
+    if source.has_heights:
+        read = metres_of(source, name, data, window.crs).metres(read.astype(np.float64))
+    return read, known
 
 
 def as_geotiff(bands: np.ndarray, known: np.ndarray, window: FetchGrid) -> bytes:
@@ -331,3 +327,25 @@ def as_geotiff(bands: np.ndarray, known: np.ndarray, window: FetchGrid) -> bytes
             else:
                 file.write_mask(known)
         return bytes(memory.read())
+
+
+UNITS = ("m",)
+"""Of what is written: a CRS in feet would else be asked for the heights' unit."""
+
+
+def metres_of(source: CatalogueSource, name: str, data: Any, crs: CRS) -> HeightBand:
+    """Conversion of a file's numbers to metres, by its unit, scale and offset. data: opened by
+    rasterio; crs: used if the file has none. `MapFetchError` if the unit is unknown or the datum
+    contradicts the source.
+    """
+    try:
+        stated = stated_heights(crs if data.crs is None else CRS(data.crs), data.units[0], name)
+        band, _ = height_band(Path(name), data, stated, None, None, DEFAULT_RULES)
+    except (GeoreferenceError, MapSourceError) as error:
+        raise MapFetchError(f"{source.name}: {error}") from error
+    if stated.datum is not None and stated.datum != source.vertical_datum:
+        raise MapFetchError(
+            f"{source.name}: the heights of {name} are {stated.datum} by its CRS ({stated.crs}), "
+            f"the source says {source.vertical_datum}; correct its vertical_datum"
+        )
+    return band

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,27 +72,13 @@ def fetch(
     missing = [p for p in plan.pieces if not (folder / p.name).exists()]
     done = len(plan.pieces) - len(missing)
     progress(done, len(plan.pieces))
+    few = 4 * source.parallel  # at a time, so that an end does not wait for thousands
     with ThreadPoolExecutor(source.parallel, thread_name_prefix="fetch") as pool:
-        # Few at a time, so that an end does not wait for thousands.
-        waiting: set[Future[None]] = set()
-        left = iter(missing)
-        try:
-            while True:
-                for piece in left:
-                    waiting.add(pool.submit(_keep, source, piece, folder, client))
-                    if len(waiting) >= 2 * source.parallel:
-                        break
-                if not waiting:
-                    break
-                finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    future.result()
-                    done += 1
-                    progress(done, len(plan.pieces))
-        except BaseException:
-            for future in waiting:
-                future.cancel()
-            raise
+        for first in range(0, len(missing), few):
+            part = missing[first : first + few]
+            for _ in pool.map(lambda piece: _keep(source, piece, folder, client), part):
+                done += 1
+                progress(done, len(plan.pieces))
     known = assemble(source, plan, folder, out)
     if known < _LEAST_KNOWN:
         out.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from urllib.parse import urljoin, urlsplit
+from xml.etree import ElementTree
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.terms import require_allowed
@@ -34,14 +35,6 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
-class RequestLimits:
-    """Limits. rate_per_s: requests a second to one host; most_bytes: sum of all answers."""
-
-    rate_per_s: float = 4.0
-    most_bytes: int = 4 << 30
-
-
-@dataclass(frozen=True)
 class HttpAnswer:
     """An HTTP response. status: 200, 206, or one of the request's `missing`."""
 
@@ -62,16 +55,18 @@ class _Request:
 
 class HttpClient:
     """Sends GET and POST requests from any thread, within limits. `MapFetchError` for a refused
-    request or an exceeded limit. sleep, clock: in seconds; replaced in tests.
+    request or an exceeded limit. rate_per_s: requests a second to one host; most_bytes: sum of all
+    answers; sleep, clock: in seconds; replaced in tests.
     """
 
     def __init__(
         self,
-        limits: RequestLimits | None = None,
+        rate_per_s: float = 4.0,
+        most_bytes: int = 4 << 30,
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._manners = limits or RequestLimits()
+        self._rate_per_s, self._most_bytes = rate_per_s, most_bytes
         self._sleep, self._clock = sleep, clock
         self._pool = urllib3.PoolManager(num_pools=8, maxsize=8, headers={"User-Agent": _AGENT})
         self._lock = threading.Lock()
@@ -135,7 +130,7 @@ class HttpClient:
                 return answer
             why = f"status {answer.status}"
             if answer.status not in _AGAIN:
-                raise MapFetchError(f"{safe_url(url)}: {why}: {_first_words(answer.data)}")
+                raise MapFetchError(f"{safe_url(url)}: {why}: {message_text(answer.data)}")
             wait_s = max(wait_s, _told_wait_s(answer.headers))
         raise MapFetchError(f"{safe_url(url)}: given up after {_TRIES} tries: {why}")
 
@@ -143,7 +138,7 @@ class HttpClient:
         with self._lock:
             now = self._clock()
             due = max(self._due.get(host, now), now)
-            self._due[host] = due + 1.0 / self._manners.rate_per_s
+            self._due[host] = due + 1.0 / self._rate_per_s
             self._requests += 1
         if due > now:
             self._sleep(due - now)
@@ -172,9 +167,9 @@ class HttpClient:
     def _count(self, size: int) -> None:
         with self._lock:
             self._bytes += size
-            if self._bytes > self._manners.most_bytes:
+            if self._bytes > self._most_bytes:
                 raise MapFetchError(
-                    f"more than {self._manners.most_bytes / 1e6:.0f} MB came: a smaller area, a "
+                    f"more than {self._most_bytes / 1e6:.0f} MB came: a smaller area, a "
                     "coarser --resolution, or a higher --most-mb"
                 )
 
@@ -198,5 +193,22 @@ def _told_wait_s(headers: Mapping[str, str]) -> float:
     return min(seconds, _LONGEST_WAIT_S) if seconds > 0 else 0.0  # false for NaN, too
 
 
-def _first_words(data: bytes) -> str:
-    return " ".join(data[:300].decode("utf-8", "replace").split())
+_MOST_BYTES = 32 << 20
+
+
+def parse_xml(data: bytes) -> ElementTree.Element:
+    """Parse XML; returns the root. `MapFetchError` for over 32 MiB and for entities of its own,
+    which can expand without limit; ParseError for invalid XML.
+    """
+    if len(data) > _MOST_BYTES or b"<!ENTITY" in data:
+        raise MapFetchError("a server's XML is too long, or brings entities of its own")
+    return ElementTree.fromstring(data)
+
+
+def message_text(data: bytes) -> str:
+    """Text of a server's message, for an error; tags of XML are removed."""
+    try:
+        words = " ".join(t.strip() for t in parse_xml(data[:65536]).itertext() if t.strip())
+    except (ElementTree.ParseError, MapFetchError):
+        words = data[:300].decode("utf-8", "replace")
+    return " ".join(words.split())[:300]

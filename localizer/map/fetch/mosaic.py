@@ -10,16 +10,13 @@ from typing import Any
 import numpy as np
 import rasterio
 from PIL import Image
-from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.io import MemoryFile
-from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.cloud import NODATA, require_8_bits
-from localizer.map.fetch.heights import UNITS, metres_of
+from localizer.map.fetch.cloud import NODATA, UNITS, metres_of, require_8_bits, warped
 from localizer.map.fetch.raster import FetchPlan, Piece
 from localizer.map.importers.raster_file import offline
 
@@ -144,17 +141,7 @@ def _values(
     wanted = 1 if source.has_heights else 3
     if piece.placed and image.crs is not None and not image.transform.is_identity:
         window = plan.grid.window(piece.column, piece.row, piece.width, piece.height)
-        how = Resampling.bilinear if source.has_heights else Resampling.average
-        nodata = source.nodata if source.nodata is not None else image.nodata
-        options: dict[str, Any] = {"add_alpha": True}
-        if nodata is not None:
-            options = {"src_nodata": nodata, "nodata": nodata}
-        with WarpedVRT(
-            image, crs=window.crs.to_wkt(), transform=window.transform, width=window.width,
-            height=window.height, resampling=how, tolerance=0.01, **options,
-        ) as warped:  # fmt: skip
-            bands = list(range(1, min(wanted, image.count) + 1))
-            values, known = warped.read(bands), warped.dataset_mask() > 0
+        values, known = warped(source, piece.name, image, window)
     else:
         if (image.width, image.height) != (piece.width, piece.height):
             raise MapFetchError(f"{source.name}: piece {piece.name} has another size")
@@ -162,9 +149,9 @@ def _values(
         if source.nodata is not None:
             known &= values[0] != source.nodata
         values = values[:wanted]
-    if source.has_heights:
-        band = metres_of(source, piece.name, image, plan.grid.crs)
-        values = band.metres(values.astype(np.float64))
+        if source.has_heights:
+            band = metres_of(source, piece.name, image, plan.grid.crs)
+            values = band.metres(values.astype(np.float64))
     if len(values) < wanted:
         values = np.repeat(values[:1], wanted, axis=0)
     return values, known & np.isfinite(values.astype(np.float64)).all(axis=0)

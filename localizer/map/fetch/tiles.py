@@ -15,7 +15,7 @@ from pyproj.exceptions import CRSError
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.http_client import HttpClient, safe_url
+from localizer.map.fetch.http_client import HttpClient, message_text, parse_xml, safe_url
 from localizer.map.fetch.raster import (
     FetchPlan,
     Piece,
@@ -25,7 +25,6 @@ from localizer.map.fetch.raster import (
     split_grid,
 )
 from localizer.map.fetch.terms import require_allowed
-from localizer.map.fetch.xml import message_text, parse_xml
 
 _BYTES = 0.4  # a pixel, of a photograph as JPEG
 _HALF_M = 20_037_508.342789244  # of the square of Web Mercator

@@ -11,7 +11,7 @@ from pyproj import CRS
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
-from localizer.map.fetch.http_client import HttpClient, safe_url
+from localizer.map.fetch.http_client import HttpClient, message_text, parse_xml, safe_url
 from localizer.map.fetch.raster import (
     FetchGrid,
     FetchPlan,
@@ -21,7 +21,6 @@ from localizer.map.fetch.raster import (
     north_first,
     split_grid,
 )
-from localizer.map.fetch.xml import message_text, parse_xml
 
 _JPEG_BYTES, _HEIGHT_BYTES = 0.4, 4.0
 _MARGIN = 2  # pixels of a coverage that is cut by its own grid, so that no seam stays

@@ -16,7 +16,8 @@ from pyproj.exceptions import CRSError
 from localizer.errors import GeoreferenceError
 from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.pose import Array, so3_exp
-from localizer.map.importers.height_crs import datum_doubt, far_outside, horizontal_unit_m
+from localizer.map.importers.height_crs import horizontal_unit_m, place_doubts
+from localizer.map.importers.rules import ImportRules
 from localizer.plain_files import plain_text
 from localizer.strict_yaml import load_json
 
@@ -47,23 +48,15 @@ class Georeference:
         turn = so3_exp([0.0, 0.0, -np.radians(self.heading_deg)])
         return LocalFrame(self.origin).ecef_from_enu.apply(points @ turn.T)
 
-    def datum_doubt(self, points: Array) -> str | None:
-        """Warning about the transformation from its CRS to WGS84, see `height_crs.datum_doubt`."""
+    def doubts(self, points: Array, source: Path, rules: ImportRules) -> list[str]:
+        """Warnings about the place of a mesh with points (N, 3), see `height_crs.place_doubts`."""
         if self.crs is None:
-            return None
-        placed = points.mean(axis=0) + np.array(self.offset)
-        lon, lat = _geographic(self.crs).transform(placed[0], placed[1])
-        return datum_doubt(CRS(self.crs), float(lon), float(lat)) if np.isfinite(lon) else None
-
-    def far_outside(self, points: Array) -> str | None:
-        """Warning if points (N, 3) are far outside the CRS's area, see `height_crs.far_outside`."""
-        if self.crs is None:
-            return None
+            return []
         placed = points + np.array(self.offset)
         lon, lat = _geographic(self.crs).transform(placed[:, 0], placed[:, 1])
         if not np.isfinite(lon).all():
-            return None  # an error where it is placed
-        return far_outside(CRS(self.crs), np.asarray(lon), np.asarray(lat))
+            return []  # an error where it is placed
+        return place_doubts(CRS(self.crs), np.asarray(lon), np.asarray(lat), source, rules)
 
 
 def read_georeference(path: Path) -> Georeference:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +28,7 @@ from localizer.map.importers.gltf_data import (
     vector,
 )
 from localizer.map.importers.materials import cut_out, material_of
-from localizer.map.importers.rules import ImportRules
+from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
 from localizer.map.importers.textures import (
     decode_alpha,
     decode_image,
@@ -70,42 +71,46 @@ _OUTSIDE_UNIT_SQUARE = 0.01  # texture coordinates off by less are rounding, not
 MALFORMED = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
 
 
+@contextmanager
+def _malformed_named() -> Iterator[None]:
+    try:
+        yield
+    except (*MALFORMED, RecursionError) as error:
+        raise MapSourceError(f"malformed glTF: {error!r}") from error
+
+
 def read_gltf(
-    data: bytes, read_uri: Reader, rules: ImportRules | None = None
+    data: bytes, read_uri: Reader, rules: ImportRules = DEFAULT_RULES
 ) -> tuple[list[SourceMesh], Array]:
     """Meshes of a GLB or glTF document, and its CESIUM_RTC centre (3,), zero when it has none.
 
     Meshes of one image are merged. Positions are in the document's axes (y up), nodes applied.
     `MapSourceError` if it is malformed.
     """
-    try:
-        document = _Document(data, read_uri, rules or ImportRules())
+    with _malformed_named():
+        document = _Document(data, read_uri, rules)
         return document.meshes(), document.rtc_center()
-    except (*MALFORMED, RecursionError) as error:
-        raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
-def gltf_weight(data: bytes, read_uri: Reader, rules: ImportRules | None = None) -> tuple[int, int]:
+def gltf_weight(
+    data: bytes, read_uri: Reader, rules: ImportRules = DEFAULT_RULES
+) -> tuple[int, int]:
     """Triangles and texels of a document, from its headers alone; see `read_gltf`. `MapSourceError`
     if it is malformed.
     """
-    try:
-        return _Document(data, read_uri, rules or ImportRules()).weight()
-    except MALFORMED as error:
-        raise MapSourceError(f"malformed glTF: {error!r}") from error
+    with _malformed_named():
+        return _Document(data, read_uri, rules).weight()
 
 
 def gltf_bounds(
-    data: bytes, read_uri: Reader, rules: ImportRules | None = None
+    data: bytes, read_uri: Reader, rules: ImportRules = DEFAULT_RULES
 ) -> tuple[Array, Array]:
     """Corners (N, 3) of boxes that hold the document's surfaces, from its headers where they state
     them, and its CESIUM_RTC centre (3,); see `read_gltf`. `MapSourceError` if it is malformed.
     """
-    try:
-        document = _Document(data, read_uri, rules or ImportRules())
+    with _malformed_named():
+        document = _Document(data, read_uri, rules)
         return document.corners(), document.rtc_center()
-    except (*MALFORMED, RecursionError) as error:
-        raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from pyproj.transformer import TransformerGroup
 
 from localizer.errors import GeoreferenceError
 from localizer.geometry.pose import Array
+from localizer.map.importers.rules import ImportRules
 from localizer.map.source import VerticalDatum
 
 _FOOT, _US_FOOT = 0.3048, 1200 / 3937
@@ -165,6 +166,17 @@ def horizontal_unit_m(crs: CRS) -> float:
     """Metres per unit of a projected CRS; 1 for degrees."""
     flat = flat_crs(crs)
     return float(flat.axis_info[0].unit_conversion_factor) if flat.is_projected else 1.0
+
+
+def place_doubts(crs: CRS, lon: Array, lat: Array, source: object, rules: ImportRules) -> list[str]:
+    """Warnings about the position of a source with this CRS, by positions (N,) of it, degrees.
+    `MapSourceError` if it is far outside the CRS's area and the user does not accept this.
+    """
+    text = far_outside(crs, lon, lat)
+    if text is not None:
+        return [rules.accept("area", f"{source}: {text}")]
+    unsure = datum_doubt(crs, float(np.mean(lon)), float(np.mean(lat)))
+    return [] if unsure is None else [f"{Path(str(source)).name}: {unsure}"]
 
 
 def far_outside(crs: CRS, lon: Array, lat: Array) -> str | None:

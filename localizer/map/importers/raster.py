@@ -8,6 +8,7 @@ skirts along the tile borders hide the cracks between levels.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -216,8 +217,7 @@ def _read_rasters(
         bounds = rasterio.warp.transform_bounds(
             flat_crs(CRS(heights.crs)), grid.crs, *heights.bounds
         )
-        left, right = sorted(bounds[::2])
-        bottom, top = sorted(bounds[1::2])
+        right, bottom = max(bounds[::2]), min(bounds[1::2])
         # With what lies beside them: world files, statistics, overviews, masks.
         beside = {Path(name) for data in (heights, colours) for name in data.files}
         root = RasterTile(dsm, ortho, grid, 0, 0, 0, band, bands, rules)
@@ -227,7 +227,7 @@ def _read_rasters(
             f"{dsm.name}: heights above {stated.crs}; they are lifted by EGM96, which may differ "
             "from it by a metre or two: give --geoid-separation from its own calculator"
         )
-    node = _Tree(rules, (left, bottom, right, top)).node(root)
+    node = _node(root, (right, bottom), itertools.count(1))
     options = "" if band == METRES else str(band)
     return SourceTree(
         node,
@@ -244,30 +244,22 @@ def _read_rasters(
     )
 
 
-class _Tree:
-    """Makes the quadtree's nodes, and counts them. bounds: the DSM's left, bottom, right, top in
-    the grid's CRS.
+def _node(tile: RasterTile, corner: tuple[float, float], numbers: Iterator[int]) -> SourceNode:
+    """The subtree of a tile. corner: the DSM's right and bottom edge in the grid's CRS; numbers: of
+    the nodes.
     """
-
-    def __init__(self, rules: ImportRules, bounds: tuple[float, float, float, float]) -> None:
-        self._rules, self._bounds, self._count = rules, bounds, 0
-
-    def node(self, tile: RasterTile) -> SourceNode:
-        """The subtree of a tile."""
-        self._count += 1
-        self._rules.require("nodes", self._count, tile.dsm)
-        grid, bounds = tile.grid, self._bounds
-        children = []
-        if tile.level < grid.levels - 1:
-            for row in (2 * tile.row, 2 * tile.row + 1):
-                for column in (2 * tile.column, 2 * tile.column + 1):
-                    child = replace(tile, level=tile.level + 1, column=column, row=row)
-                    left, top = child.corner
-                    # The last vertex sits half a step inside the DSM's edge.
-                    if left < bounds[2] - grid.step[0] and top > bounds[1] + grid.step[1]:
-                        children.append(self.node(child))
-        error = ERROR_PER_STEP * max(tile.step) if children else 0.0
-        return SourceNode(error, True, (tile,), children)
+    tile.rules.require("nodes", next(numbers), tile.dsm)
+    grid, children = tile.grid, []
+    if tile.level < grid.levels - 1:
+        for row in (2 * tile.row, 2 * tile.row + 1):
+            for column in (2 * tile.column, 2 * tile.column + 1):
+                child = replace(tile, level=tile.level + 1, column=column, row=row)
+                left, top = child.corner
+                # The last vertex sits half a step inside the DSM's edge.
+                if left < corner[0] - grid.step[0] and top > corner[1] + grid.step[1]:
+                    children.append(_node(child, corner, numbers))
+    error = ERROR_PER_STEP * max(tile.step) if children else 0.0
+    return SourceNode(error, True, (tile,), children)
 
 
 def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path, list[str]]:

@@ -24,9 +24,8 @@ from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.pose import Array
 from localizer.map.importers.height_crs import (
     StatedHeights,
-    datum_doubt,
-    far_outside,
     horizontal_unit_m,
+    place_doubts,
     unit_of,
 )
 from localizer.map.importers.rules import ImportRules, require_plain_file
@@ -169,11 +168,7 @@ def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
             f"{path}: reaches from longitude {min(x):.4f} to {max(x):.4f}, beyond the date line; "
             "warp it into a projected CRS, such as the UTM zone there (gdalwarp -t_srs)"
         )
-    text = far_outside(crs, lon, lat)
-    if text is not None:
-        return [rules.accept("area", f"{path}: {text}")]
-    unsure = datum_doubt(crs, float(np.mean(lon)), float(np.mean(lat)))
-    return [] if unsure is None else [f"{path.name}: {unsure}"]
+    return place_doubts(crs, lon, lat, path, rules)
 
 
 def has_own_mask(data: DatasetReader) -> bool:

@@ -17,6 +17,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic, geo
 from localizer.geometry.pose import Array
 from localizer.map.importers.georeference import UpAxis
 from localizer.map.importers.gltf import gltf_bounds, gltf_weight, read_gltf
+from localizer.map.importers.gltf_data import vector
 from localizer.map.importers.referenced_files import file_of, files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.importers.textures import transform_mesh
@@ -334,25 +335,15 @@ def _unwrap_b3dm(data: bytes) -> tuple[bytes, Array]:
         if isinstance(center, dict):  # in the binary body
             at = 28 + tables[0] + int(center["byteOffset"])
             center = struct.unpack_from("<3f", data[: 28 + tables[0] + tables[1]], at)
-        rtc = np.asarray(center, np.float64)
     except (ValueError, AttributeError, KeyError, TypeError, struct.error) as error:
         raise MapSourceError(f"b3dm feature table cannot be read: {error}") from error
-    if rtc.shape != (3,) or not np.isfinite(rtc).all():
-        raise MapSourceError("b3dm RTC_CENTER is not three finite numbers")
-    return data[start:length], rtc
+    return data[start:length], vector(center, 3, "b3dm RTC_CENTER")
 
 
 def _transform(data: dict[str, Any], where: str) -> Array:
-    values = data.get("transform")
-    if values is None:
+    if data.get("transform") is None:
         return np.eye(4)
-    try:
-        T = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise MapSourceError(f"{where}: a transform is not numbers") from error
-    if T.shape != (16,) or not np.isfinite(T).all():
-        raise MapSourceError(f"{where}: a transform is not 16 finite numbers")
-    columns: Array = T.reshape(4, 4).T.copy()
+    columns: Array = vector(data["transform"], 16, f"{where}: a transform").reshape(4, 4).T.copy()
     return columns
 
 
@@ -403,9 +394,10 @@ def _stated_centre(root: dict[str, Any], where: str) -> Array:
     T = _transform(root, where)
     if np.linalg.norm(T[:3, 3]) > 1e6:
         return np.asarray(T[:3, 3])
-    volume = _object(root.get("boundingVolume"), f"{where}: the root's boundingVolume")
+    bounds = f"{where}: the root's boundingVolume"
+    volume = _object(root.get("boundingVolume"), bounds)
     if "region" in volume:
-        west, south, east, north, low, _ = _numbers(volume["region"], 6, where)
+        west, south, east, north, low, _ = vector(volume["region"], 6, bounds)
         if _is_in_degrees(volume["region"]):
             west, south, east, north = np.radians((west, south, east, north))
         if east < west:  # across the 180th meridian (3D Tiles 1.1, 3.5.2)
@@ -413,7 +405,7 @@ def _stated_centre(root: dict[str, Any], where: str) -> Array:
         lat, lon = np.degrees(0.5 * (south + north)), np.degrees(0.5 * (west + east))
         return ecef_from_geodetic(lat, lon, low)
     key = "box" if "box" in volume else "sphere"
-    centre = _numbers(volume.get(key), 12 if key == "box" else 4, where)[:3]
+    centre = vector(volume.get(key), 12 if key == "box" else 4, bounds)[:3]
     return np.asarray(T[:3, :3] @ centre + T[:3, 3])
 
 
@@ -438,16 +430,6 @@ def _corners(volume: Any, T: Array) -> Array | None:
     except (TypeError, ValueError):
         return None
     return corners if np.isfinite(corners).all() else None
-
-
-def _numbers(values: Any, length: int, where: str) -> Array:
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape != (length,) or not np.isfinite(array).all():
-        raise MapSourceError(f"{where}: the root's boundingVolume is not {length} finite numbers")
-    return array
 
 
 def _number(value: Any, what: str) -> float:

@@ -120,7 +120,8 @@ def check_map(cache: TileCache, use: MapUse) -> MapCheck:
     """
     mosaic = render_mosaic(cache)
     gaps, holes = _holes(mosaic)
-    blank = _blank(mosaic) | _without_texels(cache, mosaic, use)
+    ratio = _texel_ratio(cache, mosaic, use)
+    blank = _blank(mosaic) | (~gaps & (ratio == 0.0))  # flat colours instead of imagery
     seams = find_seams(cache, mosaic)
     shift = measure_alignment(mosaic)
     kind = map_kind(cache)
@@ -138,12 +139,12 @@ def check_map(cache: TileCache, use: MapUse) -> MapCheck:
     )
     pictures = {
         "coverage": _painted(mosaic, {(220, 0, 200): holes, (255, 140, 0): blank}, gaps & ~holes),
-        "texels": _texel_picture(cache, mosaic, use),
+        "texels": _texel_picture(mosaic, ratio),
         "seams": _seam_picture(mosaic, seams),
         "alignment": _alignment_picture(mosaic),
     }
     rows, columns = gaps.shape
-    faulty = gaps | blank | (_texel_ratio(cache, mosaic, use) > _TOO_COARSE)
+    faulty = gaps | blank | (ratio > _TOO_COARSE)
     usable = usable_part(mosaic, faulty, use.height_m, cache.frame)
     if any(f.name == _GROUND and f.grade is Grade.BAD for f in findings):
         usable = None
@@ -156,8 +157,7 @@ def find_seams(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
     grey = mosaic.rgb.astype(np.float32).mean(axis=2)
     found = []
     for node in index.leaves:
-        top, left = mosaic.pixel(float(index.box_min[node, 0]), float(index.box_max[node, 1]))
-        bottom, right = mosaic.pixel(float(index.box_max[node, 0]), float(index.box_min[node, 1]))
+        top, left, bottom, right = _edges(cache, mosaic, int(node))
         a, b = (round(np.clip(x, 0, rows)) for x in (top, bottom))
         c, d = (round(np.clip(x, 0, columns)) for x in (left, right))
         for across, at, (begin, end) in ((1, d, (a, b)), (0, b, (c, d))):
@@ -168,6 +168,12 @@ def find_seams(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
             steps = [_step(layer, at, (begin, end), across) for layer in (mosaic.height, grey)]
             found.append(Seam(ends, steps[0], steps[1]))
     return found
+
+
+def _edges(cache: TileCache, mosaic: Mosaic, node: int) -> tuple[float, float, float, float]:
+    """First row and column of a node's box in the mosaic, and their ends."""
+    (west, south), (east, north) = cache.index.box_min[node, :2], cache.index.box_max[node, :2]
+    return (*mosaic.pixel(float(west), float(north)), *mosaic.pixel(float(east), float(south)))
 
 
 def _step(layer: NDArray[np.float32], at: int, ends: tuple[int, int], across: int) -> float:
@@ -201,11 +207,6 @@ def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
     large = stats[:, cv2.CC_STAT_AREA] * mosaic.gsd_m**2 >= _LEAST_BLANK_M2
     large[0] = False
     return np.asarray(large[labels])
-
-
-def _without_texels(cache: TileCache, mosaic: Mosaic, use: MapUse) -> NDArray[np.bool_]:
-    """Mask (h, w) of the surface with flat colours instead of imagery."""
-    return np.asarray(~np.isnan(mosaic.height) & (_texel_ratio(cache, mosaic, use) == 0.0))
 
 
 def _flat_share(mosaic: Mosaic) -> float:
@@ -385,17 +386,15 @@ def _texel_ratio(cache: TileCache, mosaic: Mosaic, use: MapUse) -> NDArray[np.fl
     index = cache.index
     ratio = np.zeros(mosaic.height.shape, np.float32)
     for node in np.flatnonzero((index.child_count == 0) & (index.gsd > 0)):
-        top, left = mosaic.pixel(float(index.box_min[node, 0]), float(index.box_max[node, 1]))
-        bottom, right = mosaic.pixel(float(index.box_max[node, 0]), float(index.box_min[node, 1]))
+        top, left, bottom, right = _edges(cache, mosaic, int(node))
         part = tuple(slice(max(int(a), 0), max(int(np.ceil(b)), 0)) for a, b in
                      ((top, bottom), (left, right)))  # fmt: skip
         ratio[part] = index.gsd[node] / use.pixel_m
     return ratio
 
 
-def _texel_picture(cache: TileCache, mosaic: Mosaic, use: MapUse) -> Image:
+def _texel_picture(mosaic: Mosaic, ratio: NDArray[np.float32]) -> Image:
     """Texels over working pixels, from green (fine) to red (four and more)."""
-    ratio = _texel_ratio(cache, mosaic, use)
     level = np.clip(1 - ratio / _TOO_COARSE, 0, 1)
     colours = np.stack([255 * (1 - level), 200 * level, np.full_like(level, 40)], axis=2)
     mixed = 0.5 * mosaic.rgb + 0.5 * colours

@@ -26,8 +26,6 @@ HOLE_CELL_M = 1.0
 MIN_HOLE_M2 = 25.0  # smaller gaps are ponds, glass roofs and other failures of photogrammetry
 _MAX_CELLS = 20_000 * 20_000
 
-# Camera axes (x right, y down, z forward) of a camera that looks along the body's x (FRD).
-
 
 @dataclass(frozen=True)
 class LevelSummary:
@@ -202,15 +200,11 @@ def _cut(cache: TileCache, level: int | None) -> Iterator[int]:
     """Tiles that show the surface once: at a depth of the tree, or (None) the finest."""
     index = cache.index
     depth = _depths(cache)
-    for node in range(len(depth)):
-        adds = index.refine[node] != 0  # ADD: the node's own tiles stay beside its children's
-        if level is None:
-            taken = index.child_count[node] == 0 or adds
-        else:
-            ends_above = depth[node] < level and index.child_count[node] == 0
-            taken = depth[node] == level or ends_above or (adds and depth[node] < level)
-        if taken:
-            yield from index.tiles_of(node)
+    last = depth.max() if level is None else level
+    # ADD (refine 1): the node's own tiles stay beside its children's.
+    stays = (index.child_count == 0) | (index.refine != 0)
+    for node in np.flatnonzero((depth == last) | (stays & (depth < last))):
+        yield from index.tiles_of(int(node))
 
 
 class _Occupancy:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -59,36 +58,31 @@ def measure_kind(
     with TileStreamer(cache) as streamer:
         renderer = NumbaRenderer(streamer, 1)
         try:
-            found = heights or _heights(_Sampler(cache, renderer))
-            resolution = _resolution(_Sampler(cache, renderer), cache.manifest.gsd_m)
+            found = heights or _heights(cache, renderer)
+            resolution = _resolution(cache, renderer)
         finally:
             renderer.close()
     resolution = round(float(np.clip(resolution, *RESOLUTION_M)), 4)
     return MapKind(found, UNKNOWN_HEIGHT_SIGMA_M[found], resolution, imagery_date, sensor)
 
 
-@dataclass(frozen=True)
-class _Sampler:
-    """Makes vertical views of squares about the centres of leaves, spread over the map."""
-
-    cache: TileCache
-    renderer: NumbaRenderer
-
-    def views(self, count: int, side_px: int, gsd_m: float) -> Iterator[tuple[Array, TopView]]:
-        """The centre (2,), east and north m, of each square, and its view."""
-        index = self.cache.index
-        leaves = index.leaves
-        spread = np.linspace(0, len(leaves) - 1, min(count, len(leaves)))
-        chosen = leaves[spread.round().astype(int)]
-        base_m = float(index.box_min[0, 2])
-        for leaf in chosen:
-            centre: Array = 0.5 * (index.box_min[leaf] + index.box_max[leaf])[:2]
-            yield centre, render_top_view(self.renderer, centre, side_px, gsd_m, base_m)
+def _views(
+    cache: TileCache, renderer: NumbaRenderer, count: int, side_px: int, gsd_m: float
+) -> Iterator[tuple[Array, TopView]]:
+    """Vertical views of squares about the centres of leaves, spread over the map: the centre (2,),
+    east and north m, of each square, and its view.
+    """
+    index = cache.index
+    spread = np.linspace(0, len(index.leaves) - 1, min(count, len(index.leaves)))
+    base_m = float(index.box_min[0, 2])
+    for leaf in index.leaves[spread.round().astype(int)]:
+        centre: Array = 0.5 * (index.box_min[leaf] + index.box_max[leaf])[:2]
+        yield centre, render_top_view(renderer, centre, side_px, gsd_m, base_m)
 
 
-def _heights(sampler: _Sampler) -> Heights:
+def _heights(cache: TileCache, renderer: NumbaRenderer) -> Heights:
     points, standing, known = [], 0, 0
-    for centre, view in sampler.views(_SQUARES, _CELLS, _CELL_M):
+    for centre, view in _views(cache, renderer, _SQUARES, _CELLS, _CELL_M):
         shown = np.isfinite(view.height)
         standing += int(object_mask(view.height, _CELL_M).sum())
         known += int(shown.sum())
@@ -131,14 +125,14 @@ def _from_plane_m(points: Array) -> float:
     return float(np.std(level - design @ np.linalg.lstsq(design, level, rcond=None)[0]))
 
 
-def _resolution(sampler: _Sampler, texel_m: float) -> float:
+def _resolution(cache: TileCache, renderer: NumbaRenderer) -> float:
     """Resolution of the imagery (m); the texel size if it cannot be measured."""
-    texel_m = texel_m or _PALETTE_M
-    low, high = sampler.cache.index.box_min[0], sampler.cache.index.box_max[0]
+    texel_m = cache.manifest.gsd_m or _PALETTE_M
+    low, high = cache.index.box_min[0], cache.index.box_max[0]
     room = float((high - low)[:2].min()) / texel_m
     texels = max(min(_TEXELS, 2 ** int(np.log2(max(room, 1.0)))), _LEAST_TEXELS)
     spectra = []
-    for _, view in sampler.views(_IMAGES, 2 * texels, texel_m / 2):
+    for _, view in _views(cache, renderer, _IMAGES, 2 * texels, texel_m / 2):
         if np.isfinite(view.height).mean() >= _KNOWN:
             grey = view.rgb.mean(axis=2, dtype=np.float32)
             if grey.std() > 2.0:

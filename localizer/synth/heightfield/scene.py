@@ -130,9 +130,7 @@ def bake_texture(
     `light_scene`.
     """
     height, cell = scene.height, scene.cell_m
-    block_max = cv2.dilate(height, np.ones((3, 3), np.uint8))
     n = height.shape[0]
-    block_max = block_max.reshape(n // BLOCK, BLOCK, n // BLOCK, BLOCK).max((1, 3))
     if texel_cells > 1.0:
         side = max(round(n / texel_cells), 32)
         coarse = cv2.resize(texture, (side, side), interpolation=cv2.INTER_AREA)
@@ -142,7 +140,16 @@ def bake_texture(
         side = mips[-1].shape[0] // 2
         mips.append(cv2.resize(mips[-1], (side, side), interpolation=cv2.INTER_AREA))
     flat = np.concatenate([m.ravel() for m in mips]).astype(np.float32)
-    return LitScene(height, block_max, flat, scene.prism, scene.facades, light, sky, cell)
+    maxima = block_maxima(height)
+    return LitScene(height, maxima, flat, scene.prism, scene.facades, light, sky, cell)
+
+
+def block_maxima(height: Float32) -> Float32:
+    """The highest cell in and beside each block of the height field (n, n)."""
+    n = height.shape[0]
+    raised = cv2.dilate(height, np.ones((3, 3), np.uint8))
+    highest: Float32 = raised.reshape(n // BLOCK, BLOCK, n // BLOCK, BLOCK).max((1, 3))
+    return highest
 
 
 def omit_randomly(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:

@@ -69,9 +69,7 @@ def assign_zones(config: WorldConfig, lattice: Lattice, terrain: Terrain
     """Use of every cell that overlaps the world."""
     rng = config.rng(12)
     small = config.size_m < 1000
-    radius = config.town_radius_m
-    if radius is None:
-        radius = rng.uniform(0.2, 1.1) * config.size_m if small else 0.38 * config.size_m
+    radius = rng.uniform(0.2, 1.1) * config.size_m if small else 0.38 * config.size_m
     centre = rng.uniform(-0.3, 0.3, 2) * config.size_m if small else rng.uniform(-80, 80, 2)
     industry = rng.uniform(0, 2 * np.pi)
     wave = rng.uniform(0, 2 * np.pi, 4)

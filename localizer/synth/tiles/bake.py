@@ -17,13 +17,12 @@ from localizer.synth.paint.covers import WindowLight, new_image
 from localizer.synth.paint.ground import light_ground, paint_albedo
 from localizer.synth.paint.ground_plan import Material, PlanShape, rasterize, shape_bounds
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light
+from localizer.synth.plan.terrain import Terrain
 from localizer.synth.tiles.charts import ChartedMesh, pack
 from localizer.synth.tiles.objects import StandingObjects
 from localizer.synth.tiles.scene import TileScene
-from localizer.synth.tiles.terrain_mesh import terrain_mesh
 from localizer.synth.tiles.write import TileNode, glb_bytes
-from localizer.synth.visits.noise import noise
-from localizer.synth.visits.texture import with_new_texture, with_wet_patches
+from localizer.synth.visits.texture import noise, with_new_texture, with_wet_patches
 from localizer.types import Float32, Image
 
 _LIGHT_MARGIN_M = 60.0  # objects belong to the tile of their middle and reach out of it
@@ -178,7 +177,7 @@ class Baker:
         """Colours (n, n, 3) of a block's ground, 0 to 255, with the visit's new fine texture."""
         albedo = self._painted(region, west, north, light, np.zeros(2))
         changes = self.scene.visit.changes
-        if changes is None or not changes.regrown:
+        if changes is None:
             return albedo
         plan = self.scene.plan
         # The same draw in every block, so that what is drawn does not change at its border.
@@ -239,3 +238,85 @@ def start_worker(scene_file: Path, folder: Path) -> None:
 def bake_block(place: tuple[int, int]) -> tuple[tuple[int, int], TilePart]:
     """`Baker.block` in a worker process; returns its place, too."""
     return place, _baker[0].block(*place)
+
+
+def assemble_top(baker: Baker, column: int, row: int, parts: list[TilePart]) -> TilePart:
+    """Write the 400 m tile (column, row from south-west) over its four blocks `parts`; returns its
+    part for the tile above.
+    """
+    half = baker.scene.plan.config.half_m
+    west, north = column * TOP_M - half, (row + 1) * TOP_M - half
+    n = parts[0].ground.shape[0]
+    image = new_image(2 * n, 2 * n)
+    for part in parts:
+        i, j = round((north - part.north) / BLOCK_M) * n, round((part.west - west) / BLOCK_M) * n
+        image[i : i + n, j : j + n] = part.ground
+    mesh = ChartedMesh.merged([p.mesh for p in parts])
+    node = baker.write(TOP, (column, row), west, north, image, mesh)
+    node.children = [child for p in parts for child in p.nodes]
+    return TilePart([node], half_size(half_size(image)), mesh.at_level(ROOT).halved(2), west, north)
+
+
+def assemble_root(baker: Baker, parts: list[TilePart]) -> TileNode:
+    """Write the tile over the whole world, with trees painted on its ground."""
+    half = baker.scene.plan.config.half_m
+    n = parts[0].ground.shape[0]
+    side = round(2 * half / TOP_M) * n
+    image = new_image(side, side)
+    for part in parts:
+        i, j = round((half - part.north) / TOP_M) * n, round((part.west + half) / TOP_M) * n
+        image[i : i + n, j : j + n] = part.ground
+    gsd = 2 * half / side
+    trees = baker.scene.plan.trees
+    for (x, y), radius, seed in zip(trees.xy, trees.radius, trees.seed, strict=True):
+        tone = 0.8 + 0.4 * ((int(seed) * 7919) % 101) / 101
+        centre = (round((x + half) / gsd * 16 - 8), round((half - y) / gsd * 16 - 8))
+        colour = (74 * tone, 88 * tone, 50 * tone)
+        cv2.circle(image, centre, round(radius / gsd * 16), colour, -1, cv2.LINE_AA, 4)
+    mesh = ChartedMesh.merged([p.mesh for p in parts])
+    node = baker.write(ROOT, (0, 0), -half, half, image, mesh)
+    node.children = [child for p in parts for child in p.nodes]
+    return node
+
+
+def terrain_mesh(
+    terrain: Terrain, west: float, north: float, side: float, step: int
+) -> tuple[Array, Array, NDArray[np.int64], float]:
+    """Terrain of a square tile from every `step`-th grid node, with a skirt.
+
+    Returns positions (V, 3), place in the tile (V, 2) as a share of its side (right, down), faces
+    (F, 3), and the largest vertical deviation from the full grid in metres.
+    """
+    spacing, half = terrain.spacing_m, terrain.half_m
+    c0, r0 = round((west + half) / spacing), round((north - side + half) / spacing)
+    cells = round(side / spacing)
+    fine = terrain.heights[r0 : r0 + cells + 1, c0 : c0 + cells + 1].astype(np.float64)
+    grid = fine[::step, ::step]
+    coarse = Terrain(grid.astype(np.float32), spacing * step, terrain.river)
+    axis = np.linspace(-side / 2, side / 2, cells + 1)
+    fx, fy = np.meshgrid(axis, axis)
+    error = float(np.abs(coarse.height(fx, fy) - fine).max())
+
+    n = grid.shape[0]
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
+    top = np.stack([west + x * side, north - side + y * side, grid], -1).reshape(-1, 3)
+    share = np.stack([x, 1 - y], -1).reshape(-1, 2)
+    index = np.arange(n * n).reshape(n, n)
+    sw, se, nw, ne = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    lower, upper = np.stack([sw, se, ne], -1), np.stack([sw, ne, nw], -1)
+    faces = [lower.reshape(-1, 3), upper.reshape(-1, 3)]
+
+    # Neighbours of another level may lie lower by both their errors.
+    depth = 1.0 + 0.05 * spacing * step + 2 * error
+    ring = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
+    skirt = top[ring] - [0, 0, depth]
+    a, b = ring, np.roll(ring, -1)
+    low_a = n * n + np.arange(len(ring))
+    low_b = np.roll(low_a, -1)
+    faces += [np.stack([a, low_a, low_b], -1), np.stack([a, low_b, b], -1)]
+    return (
+        np.concatenate([top, skirt]),
+        np.concatenate([share, share[ring]]),
+        np.concatenate(faces).astype(np.int64),
+        error,
+    )

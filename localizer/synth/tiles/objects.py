@@ -6,6 +6,7 @@ from collections import defaultdict
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
@@ -71,8 +72,7 @@ class StandingObjects:
     def _hedges(self, west: float, south: float, light: WindowLight) -> list[ChartedMesh]:
         parts = []
         for hedge in self._scene.plan.hedges:
-            middle = (hedge.a + hedge.b) / 2
-            if not (west <= middle[0] < west + LEAF_M and south <= middle[1] < south + LEAF_M):
+            if not _in_leaf((hedge.a + hedge.b) / 2, west, south):
                 continue
             rng = np.random.default_rng(hedge.seed)
             colour = np.array([84.0, 98.0, 56.0]) * rng.normal(1, 0.12)
@@ -96,9 +96,7 @@ class StandingObjects:
     ) -> ChartedMesh:
         trees = self._scene.plan.trees
         xy = trees.xy
-        inside = (xy[:, 0] >= west) & (xy[:, 0] < west + LEAF_M)
-        inside &= (xy[:, 1] >= south) & (xy[:, 1] < south + LEAF_M)
-        chosen = np.flatnonzero(inside)
+        chosen = np.flatnonzero(_in_leaf(xy, west, south))
         if not len(chosen):
             return ChartedMesh.empty()
         z = self._scene.plan.terrain.height(xy[chosen, 0], xy[chosen, 1])
@@ -114,9 +112,7 @@ class StandingObjects:
 
     def _cars(self, west: float, south: float, light: WindowLight) -> ChartedMesh:
         cars = self._scene.cars
-        inside = (cars[:, 0] >= west) & (cars[:, 0] < west + LEAF_M)
-        inside &= (cars[:, 1] >= south) & (cars[:, 1] < south + LEAF_M)
-        cars = cars[inside]
+        cars = cars[_in_leaf(cars[:, :2], west, south)]
         if not len(cars):
             return ChartedMesh.empty()
         shape = car_shape()
@@ -141,3 +137,9 @@ class StandingObjects:
             np.repeat(chart.reshape(-1), m).astype(np.int64), st.copy(), faces.astype(np.int64),
             np.full(len(faces), NEAR_LEVELS, np.uint8), tuple(images),
         )  # fmt: skip
+
+
+def _in_leaf(xy: Array, west: float, south: float) -> NDArray[np.bool_]:
+    """Mask (...) of the points (..., 2) in the leaf tile whose corner is (west, south)."""
+    low = np.array([west, south])
+    return np.asarray(((xy >= low) & (xy < low + LEAF_M)).all(-1))

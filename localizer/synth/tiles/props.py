@@ -129,10 +129,7 @@ def car_mesh(colour: tuple[int, int, int] | None = None, seed: int = 0) -> TileM
     return _tile_mesh(car_shape(), car_image(chosen, seed))
 
 
-def person_mesh(
-    clothes: tuple[int, int, int] = (70, 84, 120), trousers: tuple[int, int, int] = (52, 52, 58),
-    height_m: float = 1.75,
-) -> TileMesh:  # fmt: skip
+def person_mesh(clothes: tuple[int, int, int] = (70, 84, 120), height_m: float = 1.75) -> TileMesh:
     """A standing person: a faceted body of legs, torso and head, origin between the feet."""
     sides = 6
     #        z as a share of height, half depth, half width, colour row
@@ -154,7 +151,7 @@ def person_mesh(
     last = (len(rings) - 1) * sides
     faces += [(last + k, last + (k + 1) % sides, len(positions) - 1) for k in range(sides)]
     image = np.empty((32, 8, 3), np.uint8)
-    image[:16], image[16:24], image[24:29] = trousers, clothes, (196, 152, 124)
+    image[:16], image[16:24], image[24:29] = (52, 52, 58), clothes, (196, 152, 124)
     image[29:] = (70, 52, 40)
     image[:, :4] = (image[:, :4] * 0.85).astype(np.uint8)
     return TileMesh(

@@ -18,20 +18,21 @@ _GROWTH = (1.0, 1.2)  # of a crown's radius and height, in a few years
 @dataclass(frozen=True)
 class Changes:
     """Shares of changed objects. gone, rebuilt, new: shares of the buildings; felled: share of the
-    trees (the others have grown). regrown: whether soft ground gets another fine texture. seed:
-    selects the changed objects.
+    trees (the others have grown); soft ground gets another fine texture. seed: selects the changed
+    objects.
     """
 
     gone: float = 0.03
     rebuilt: float = 0.03
     new: float = 0.03
     felled: float = 0.05
-    regrown: bool = True
     seed: int = 1
 
 
 def apply_changes(plan: WorldPlan, changes: Changes) -> WorldPlan:
-    """The plan after the changes; ground and streets stay. `regrown` is left to the tiles."""
+    """The plan after the changes; ground and streets stay. The fine texture is left to the
+    tiles.
+    """
     rng = plan.config.rng(61, changes.seed)
     draw = rng.random(len(plan.buildings))
     buildings = []

@@ -10,7 +10,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from localizer.synth.visits.noise import noise
 from localizer.types import Float32, Image
 
 _REGROWN_M = (0.6, 2.5)  # scale below which soft ground does not repeat
@@ -100,3 +99,17 @@ def coarser(image: Image, texel_px: float) -> Image:
 def draw_texel(rng: np.random.Generator) -> float:
     """Random ratio of map texel to query pixel on the ground, 1 to 4."""
     return float(np.exp(rng.uniform(0.0, np.log(4.0))))
+
+
+def noise(n: int, rng: np.random.Generator, base: int, octaves: int, gain: float) -> Float32:
+    """Fractal value noise (n, n) of zero mean. base: cells of the coarsest octave, doubled in each;
+    gain: amplitude of an octave over the one before.
+    """
+    out: Float32 = np.zeros((n, n), np.float32)
+    amplitude = np.float32(1.0)
+    for octave in range(octaves):
+        k = min(base * 2**octave, n) + 3
+        grid = rng.standard_normal((k, k), dtype=np.float32)
+        out += amplitude * cv2.resize(grid, (n, n), interpolation=cv2.INTER_CUBIC)
+        amplitude *= np.float32(gain)
+    return out

@@ -4,11 +4,84 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from localizer.geometry.pose import Array
 from localizer.synth.config import SURVEY, VisitLook, WorldConfig
 from localizer.synth.visits.changes import Changes
-from localizer.synth.visits.survey import SurveyErrors
+from localizer.synth.visits.texture import coarser
+from localizer.types import Image
+
+_BUMP_WAVES = 6  # plane waves whose sum is the surface's error
+_BUMP_M = (5.0, 25.0)  # their lengths
+_HOLE_M = (1.0, 3.5)  # radius of a hole
+_WALL = 0.35  # height of a wall's unit normal at most
+
+
+@dataclass(frozen=True)
+class SurveyErrors:
+    """Errors of one survey. bumps_m: standard deviation of the surface per axis; holes_per_km2:
+    number of holes; wall_blur_m: blur of the facades, which a survey sees at a flat angle; texel_m:
+    ground size of a texel; seed: selects the positions of bumps and holes.
+    """
+
+    bumps_m: float = 0.0
+    holes_per_km2: float = 0.0
+    wall_blur_m: float = 0.0
+    texel_m: float = 0.0
+    seed: int = 0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> SurveyErrors:
+        """Draw the errors of a good to poor survey."""
+        return cls(
+            bumps_m=float(np.exp(rng.uniform(*np.log((0.03, 0.12))))),
+            holes_per_km2=float(rng.uniform(20.0, 80.0)),
+            wall_blur_m=float(rng.uniform(0.2, 0.8)),
+            texel_m=float(np.exp(rng.uniform(*np.log((0.15, 0.4))))),
+            seed=int(rng.integers(1 << 30)),
+        )
+
+    def displaced(self, positions: Array) -> Array:
+        """Surface points (V, 3) ENU, displaced smoothly by the survey's errors."""
+        if self.bumps_m <= 0:
+            return positions
+        rng = np.random.default_rng([self.seed, 1])
+        direction = rng.standard_normal((_BUMP_WAVES, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        shortest, longest = np.log(_BUMP_M)
+        lengths = np.exp(rng.uniform(shortest, longest, _BUMP_WAVES))
+        phase = rng.uniform(0, 2 * np.pi, (3, _BUMP_WAVES))
+        along = positions @ (2 * np.pi * direction / lengths[:, None]).T
+        scale = self.bumps_m * np.sqrt(2.0 / _BUMP_WAVES)
+        moved = [np.sin(along + phase[axis]).sum(axis=1) * scale for axis in range(3)]
+        return np.asarray(positions + np.stack(moved, axis=1))
+
+    def outside_holes(self, positions: Array, faces: NDArray[np.int64], side_m: float) -> Array:
+        """Mask (F,) of the faces outside the survey's holes, in a world of `side_m`."""
+        rng = np.random.default_rng([self.seed, 2])
+        count = rng.poisson(self.holes_per_km2 * (side_m / 1000.0) ** 2)
+        centres = rng.uniform(-side_m / 2, side_m / 2, (count, 2))
+        radii = rng.uniform(*_HOLE_M, count)
+        middle = positions[faces][:, :, :2].mean(axis=1)
+        low, high = positions[:, :2].min(axis=0) - _HOLE_M[1], positions[:, :2].max(axis=0)
+        near = ((centres >= low) & (centres <= high + _HOLE_M[1])).all(axis=1)
+        kept = np.ones(len(faces), bool)
+        for centre, radius in zip(centres[near], radii[near], strict=True):
+            kept &= np.linalg.norm(middle - centre, axis=1) > radius
+        return kept
+
+    def apply_blur(self, chart: Image, gsd_m: float, normal_up: float = 1.0) -> Image:
+        """A surface's image, blurred as by the survey. gsd_m: size of its pixel; normal_up: its
+        normal's z.
+        """
+        if abs(normal_up) < _WALL and self.wall_blur_m > 0:
+            sigma = self.wall_blur_m / gsd_m
+            chart = np.asarray(cv2.GaussianBlur(chart, (0, 0), sigma), np.uint8)
+        return coarser(chart, self.texel_m / gsd_m) if min(chart.shape[:2]) > 8 else chart
+
 
 _BUILT = 0.04  # largest share of buildings gone, rebuilt, and new, each
 

@@ -20,24 +20,15 @@ from localizer.synth.appearance.model import (
     sample_appearance,
     weathered,
 )
+from localizer.training.config import OptimizerSection
 from localizer.training.data.pairs import Pair, relative_pose
 from localizer.training.data.shards import read_shard
 from localizer.training.losses import Batch
 from localizer.types import Float32, Image
 
 _POLL_S = 0.5  # between looks for a shard that is still being generated
+_CACHED_SHARDS = 700
 _MOST_DRAWS = 200  # for one sample; most pairs give one
-
-
-@dataclass(frozen=True)
-class LoaderConfig:
-    """Batch size, anchors and crop size (px); appearance: degrade the queries."""
-
-    batch: int
-    anchors: int
-    crop: tuple[int, int]
-    appearance: bool
-    cached_shards: int = 700
 
 
 @dataclass(frozen=True)
@@ -97,7 +88,7 @@ class ShardStream(BatchStream):
     def __init__(
         self,
         schedule: Schedule,
-        config: LoaderConfig,
+        config: OptimizerSection,
         seed: int,
         rank: int = 0,
         generating: Future[None] | None = None,
@@ -107,7 +98,7 @@ class ShardStream(BatchStream):
         self._generating = generating
         self._closed = threading.Event()
         self._seed = (seed,) if rank == 0 else (seed, rank)
-        self._shard = lru_cache(config.cached_shards)(self._read)
+        self._shard = lru_cache(_CACHED_SHARDS)(self._read)
 
     def close(self) -> None:
         """See `BatchStream.close`; also stops waiting for a shard."""
@@ -166,19 +157,19 @@ class TrainingSample:
     K_query: Float32
 
 
-def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> TrainingSample | None:
-    """Crop as `window_pair`; with `appearance`, images degraded by light, weather and sensor."""
-    query, reference = pair.query, pair.reference
-    if config.appearance:
-        query = weathered(query, pair.query_depth, pair.condition, rng)
-        survey = survey_appearance(rng)
-        if survey is not None:
-            reference = apply_appearance(reference, pair.reference_depth, survey, rng)
+def crop_pair(
+    pair: Pair, config: OptimizerSection, rng: np.random.Generator
+) -> TrainingSample | None:
+    """Crop as `window_pair` images that light, weather and sensor have degraded."""
+    query, reference = weathered(pair.query, pair.query_depth, pair.condition, rng), pair.reference
+    survey = survey_appearance(rng)
+    if survey is not None:
+        reference = apply_appearance(reference, pair.reference_depth, survey, rng)
     return window_pair(replace(pair, reference=reference, query=query), config, rng)
 
 
 def window_pair(
-    pair: Pair, config: LoaderConfig, rng: np.random.Generator
+    pair: Pair, config: OptimizerSection, rng: np.random.Generator
 ) -> TrainingSample | None:
     """Crop windows of the same ground from a degraded pair, with anchors, and mirror half of the
     crops. None if they share too little.

@@ -8,69 +8,43 @@ step alone, so that a run resumes exactly.
 from __future__ import annotations
 
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
 
+from localizer.training.config import LiveSection, TrainConfig
 from localizer.training.data.batches import (
     BatchStream,
-    LoaderConfig,
     TrainingSample,
     collate,
     crop_pair,
 )
-from localizer.training.data.lit_places import PlaceVisits, low_priority, make_place
-from localizer.training.data.pairs import SceneConfig, draw_views, render_pair
-from localizer.training.data.shards import PhotoSource
+from localizer.training.data.pairs import (
+    PlaceVisits,
+    draw_views,
+    low_priority,
+    make_place,
+    render_pair,
+)
 from localizer.training.losses import Batch
 
 _SPARE = 1.25  # candidates for each sample: some see too little in common
 
 
-@dataclass(frozen=True)
-class LivePlan:
-    """Schedule of the places that training steps draw from. active: number of places at a time; the
-    oldest is replaced every `steps_per_place` steps. places: number of different places;
-    flight_days: per place.
+class LiveStream(BatchStream):
+    """Makes batches like `ShardStream`, from pairs rendered on demand. rank: of this process among
+    `count`. The oldest of the places is replaced every `steps_per_scene` steps.
     """
 
-    first_seed: int
-    places: int
-    active: int
-    steps_per_place: int
-    flight_days: int
-
-    def window(self, step: int) -> range:
-        """Running numbers of a step's places."""
-        first = step // self.steps_per_place
-        return range(first, first + self.active)
-
-    def seed(self, number: int, rank: int, count: int) -> int:
-        """Seed of place `number` of process `rank` of `count`; the processes' seeds differ."""
-        return self.first_seed + (number * count + rank) % self.places
-
-
-class LiveStream(BatchStream):
-    """Makes batches like `ShardStream`, from pairs rendered on demand."""
-
-    def __init__(  # noqa: PLR0913
-        self,
-        plan: LivePlan,
-        scenes: SceneConfig,
-        photos: PhotoSource | None,
-        loader: LoaderConfig,
-        seed: int,
-        *,
-        rank: int = 0,
-        count: int = 1,
-        workers: int = 1,
-    ) -> None:
+    def __init__(self, config: TrainConfig, rank: int = 0, count: int = 1) -> None:
         super().__init__()
-        self._plan, self._scenes, self._photos = plan, scenes, photos
-        self._loader, self._seed, self._rank, self._count = loader, seed, rank, count
-        self._ahead = workers
+        assert isinstance(config.data, LiveSection)
+        self._data = config.data
+        self._scenes, self._photos = self._data.scene_config(), self._data.library()
+        self._optimizer, self._seed = config.optimizer, config.seed
+        self._rank, self._count = rank, count
+        workers = self._data.workers
         # Forked processes would inherit a GPU's context, which does not work in them.
         self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=low_priority)
         self._renderers = ThreadPoolExecutor(workers)
@@ -87,21 +61,31 @@ class LiveStream(BatchStream):
         self._load_places(step)
         rng = np.random.default_rng((self._seed, self._rank, step))
         samples: list[TrainingSample] = []
-        while len(samples) < self._loader.batch:
-            missing = self._loader.batch - len(samples)
+        while len(samples) < self._optimizer.batch:
+            missing = self._optimizer.batch - len(samples)
             draws = rng.spawn(int(missing * _SPARE) + 1)
-            made = self._renderers.map(partial(self._sample, self._plan.window(step)), draws)
+            made = self._renderers.map(partial(self._sample, self._window(step)), draws)
             samples += [sample for sample in made if sample is not None]
-        return collate(samples[: self._loader.batch])
+        return collate(samples[: self._optimizer.batch])
+
+    def _window(self, step: int) -> range:
+        """Running numbers of a step's places."""
+        first = step // self._data.steps_per_scene
+        return range(first, first + self._data.active)
+
+    def _place_seed(self, number: int) -> int:
+        """Seed of a place by its running number; those of the processes differ."""
+        own = number * self._count + self._rank
+        return self._data.first_seed + own % self._data.scenes
 
     def _load_places(self, step: int) -> None:
         """Wait for the step's places; begin to make later ones."""
-        window = self._plan.window(step)
-        for number in range(window.start, window.stop + self._ahead):
+        window = self._window(step)
+        for number in range(window.start, window.stop + self._data.workers):
             if number not in self._places and number not in self._coming:
-                seed = self._plan.seed(number, self._rank, self._count)
+                seed = self._place_seed(number)
                 self._coming[number] = self._makers.submit(
-                    make_place, seed, self._scenes, self._photos, self._plan.flight_days
+                    make_place, seed, self._scenes, self._photos, self._data.flight_days
                 )
         self._places = {k: v for k, v in self._places.items() if k in window}
         for number in window:
@@ -111,9 +95,9 @@ class LiveStream(BatchStream):
     def _sample(self, numbers: range, rng: np.random.Generator) -> TrainingSample | None:
         """A pair of one of the places; None if its views see too little in common."""
         place = self._places[int(rng.choice(numbers))]
-        lit, visit, season = place.days[int(rng.integers(self._plan.flight_days))]
+        lit, visit, season = place.days[int(rng.integers(self._data.flight_days))]
         views = draw_views(rng, place.survey, lit, self._scenes)
         if views is None:
             return None
         pair = render_pair(place.survey, lit, views, visit, place.source, season=season)
-        return crop_pair(pair, self._loader, rng)
+        return crop_pair(pair, self._optimizer, rng)

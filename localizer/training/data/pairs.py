@@ -7,6 +7,7 @@ weather and sensor are put on the query afterwards (`localizer.synth.appearance.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -27,14 +28,13 @@ from localizer.synth.heightfield.scene import (
     omit_randomly,
 )
 from localizer.synth.visits.texture import draw_texel, with_new_texture, with_wet_patches
-from localizer.training.places.changes import coarse_mesh, plain_walls
+from localizer.training.places.changes import coarse_mesh, plain_walls, season_shift
 from localizer.training.places.land import generated_place, photo_place
-from localizer.training.places.objects import new_buildings, parked_cars
+from localizer.training.places.objects import TrainingPlace, new_buildings, parked_cars
 from localizer.training.places.photos import PhotoLibrary
-from localizer.training.places.place import TrainingPlace
-from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image
 
+FIRST_WORLD_SEED = 1000  # those below belong to demos and tests
 SEASON, OUTDATED, COMBINED = "season", "outdated map", "combined"
 _PLAIN_WALLS = 0.4  # share of the maps whose facades were not photographed
 _COARSE_MESH = 0.8  # share of the maps on a photogrammetric mesh instead of the true surface
@@ -64,8 +64,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Size and variety of the scenes and views. light_variety False keeps the map's own light and
-    season in the query (the ablation of the paper's Table 4). cell_m: range of a cell's size, which
+    """Size and variety of the scenes and views. cell_m: range of a cell's size, which
     sets the altitude. conditions: one for each light in turn (`named_conditions`); empty: drawn.
     motion: exact metres and degrees between the two views; None: the training's mixture.
     """
@@ -76,7 +75,6 @@ class SceneConfig:
     photo_share: float = 0.5
     references: int = 10
     queries_per_light: int = 5
-    light_variety: bool = True
     cell_m: tuple[float, float] = (0.2, 2.2)
     conditions: tuple[str, ...] = ()
     motion: tuple[float, float] | None = None
@@ -106,8 +104,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
                 visit = named_conditions(rng, config.conditions[k // config.queries_per_light])
             else:
                 visit = draw_visit(rng)
-            fixed = None if config.light_variety else survey.light
-            lived, season = flight_day_scene(rng, place, visit, fixed)
+            lived, season = flight_day_scene(rng, place, visit)
         views = draw_views(rng, survey, lived, config)
         if views is not None:
             yield render_pair(survey, lived, views, visit, source, season=season)
@@ -156,17 +153,12 @@ def survey_scene(rng: np.random.Generator, place: TrainingPlace, config: SceneCo
 
 
 def flight_day_scene(
-    rng: np.random.Generator,
-    place: TrainingPlace,
-    visit: FlightDay,
-    light: SkyLight | None,
+    rng: np.random.Generator, place: TrainingPlace, visit: FlightDay
 ) -> tuple[LitScene, bool]:
-    """The place on the flight day, and whether its season differs from the map's. light: keeps this
-    light and the map's season; None: both are drawn.
-    """
+    """The place on the flight day, and whether its season differs from the map's."""
     land, prisms, season = place.land, list(place.prisms), False
     condition, outdated = visit.weather, visit.outdated
-    if light is None and visit.season is not False:
+    if visit.season is not False:
         season = bool(place.seasons) and rng.random() < 0.6
         albedo = place.seasons[0] if season else land.albedo
         if rng.random() < 0.7 or (visit.season and not season):
@@ -185,7 +177,7 @@ def flight_day_scene(
         direct = 0.5  # moonlight
     elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
     sun = _sun(rng, elevation, direct)
-    return light_scene(compose(land, prisms), light or sun, _sky(rng, condition)), season
+    return light_scene(compose(land, prisms), sun, _sky(rng, condition)), season
 
 
 def _car_count(rng: np.random.Generator, place: TrainingPlace) -> int:
@@ -305,3 +297,33 @@ def soften(rng: np.random.Generator, image: Image) -> Image:
 def relative_pose(pair: Pair) -> Array:
     """(4, 4) ``query_from_reference``."""
     return (pair.world_from_query.inverse @ pair.world_from_reference).matrix
+
+
+@dataclass(frozen=True)
+class PlaceVisits:
+    """A place as surveyed, and on several flight days."""
+
+    survey: LitScene
+    days: tuple[tuple[LitScene, FlightDay, bool], ...]
+    source: str
+
+
+def make_place(
+    seed: int, scenes: SceneConfig, photos: PhotoLibrary | None, flight_days: int
+) -> PlaceVisits:
+    """The place of a seed, lit and ready to render. photos: None: generated ground only."""
+    rng = np.random.default_rng(seed)
+    place, source = draw_place(rng, scenes, photos)
+    survey = survey_scene(rng, place, scenes)
+    days = []
+    for _ in range(flight_days):
+        visit = draw_visit(rng)
+        lit, season = flight_day_scene(rng, place, visit)
+        days.append((lit, visit, season))
+    return PlaceVisits(survey, tuple(days), source)
+
+
+def low_priority() -> None:
+    """Initialise a worker process: low priority, one core."""
+    os.nice(5)
+    cv2.setNumThreads(1)

@@ -10,7 +10,6 @@ import zipfile
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,23 +24,8 @@ WORLD_SHARDS = 8  # per mesh world
 WORLD_SHARD_PAIRS = 10
 
 
-@dataclass(frozen=True)
-class PhotoSource:
-    """Folder of real textures and the groups to use. held_out: of the cross-season plots, use those
-    for tests instead of the others.
-    """
-
-    root: Path
-    groups: tuple[str, ...]
-    held_out: bool = False
-
-    def library(self) -> PhotoLibrary:
-        """Open the textures; each process needs its own."""
-        return PhotoLibrary(self.root, self.groups, held_out=self.held_out)
-
-
 def write_shards(
-    out: Path, seeds: range, scenes: SceneConfig, photos: PhotoSource | None, workers: int
+    out: Path, seeds: range, scenes: SceneConfig, photos: PhotoLibrary | None, workers: int
 ) -> Iterator[Path]:
     """Generate the shards of `seeds` not on disk yet, while iterated; yields them in that order."""
     out.mkdir(parents=True, exist_ok=True)
@@ -85,10 +69,9 @@ def shard_path(folder: Path, seed: int) -> Path:
     return folder / f"{seed:08d}.npz"
 
 
-def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoSource | None) -> Path:
+def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoLibrary | None) -> Path:
     """Generate and store one place's pairs."""
-    library = None if photos is None else photos.library()
-    return store(shard_path(out, seed), list(scene_pairs(seed, scenes, library)), scenes)
+    return store(shard_path(out, seed), list(scene_pairs(seed, scenes, photos)), scenes)
 
 
 def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:

@@ -24,13 +24,19 @@ from localizer.synth.config import SURVEY, WorldConfig
 from localizer.synth.visits.texture import coarser, draw_texel
 from localizer.synth.visits.visit import Visit, draw_look
 from localizer.synth.world import WorldInfo, build_visits
-from localizer.training.data.pairs import Pair, SceneConfig, draw_condition, look_at, moved
-from localizer.training.data.seeds import FIRST_WORLD_SEED
+from localizer.training.data.pairs import (
+    FIRST_WORLD_SEED,
+    Pair,
+    SceneConfig,
+    draw_condition,
+    look_at,
+    moved,
+)
+
+_SIZE_M, _FLIGHT_DAYS = 800.0, 2
 
 
-def world_pairs(
-    seed: int, scenes: SceneConfig, *, count: int, size_m: float = 800.0, flight_days: int = 2
-) -> Iterator[Pair]:
+def world_pairs(seed: int, scenes: SceneConfig, *, count: int) -> Iterator[Pair]:
     """`count` pairs of the world of `seed`: surveyed once, seen again on other days.
     `MapSourceError` for a seed below `FIRST_WORLD_SEED`.
     """
@@ -40,8 +46,8 @@ def world_pairs(
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as stack:
         root = Path(temporary)
         looks = {root / "survey": Visit("survey", SURVEY)}
-        looks |= {root / f"day{k}": Visit("live", draw_look(rng)) for k in range(flight_days)}
-        info = build_visits(WorldConfig(seed, size_m), looks, processes=1)[0]
+        looks |= {root / f"day{k}": Visit("live", draw_look(rng)) for k in range(_FLIGHT_DAYS)}
+        info = build_visits(WorldConfig(seed, _SIZE_M), looks, processes=1)[0]
         renderers = []
         for folder in looks:
             cache = root / f"{folder.name}.cache"
@@ -51,7 +57,7 @@ def world_pairs(
         survey, days = renderers[0], renderers[1:]
         made = 0
         while made < count:
-            pair = _pair(rng, scenes, info, survey, days[made * flight_days // count])
+            pair = _pair(rng, scenes, info, survey, days[made * _FLIGHT_DAYS // count])
             if pair is not None:
                 made += 1
                 yield pair

@@ -19,7 +19,6 @@ from localizer.training.checkpoint import load_weights, read_checkpoint
 from localizer.training.config import TrainConfig
 from localizer.training.models.networks import Network, build, fuse
 from localizer.training.models.s0 import S0Net
-from localizer.training.models.tiny import parameter_count
 
 OPSET = 17
 _TOLERANCE = 2e-4  # largest difference of a feature between torch and onnxruntime
@@ -104,7 +103,7 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
             "name": f"{config.name}-float16" if half else config.name,
             "sha256": hashlib.sha256(made.read_bytes()).hexdigest(),
             "levels": [{"stride": s, "channels": config.model.channels} for s in network.strides],
-            "parameters": parameter_count(network),
+            "parameters": sum(p.numel() for p in network.parameters()),
             "training": {
                 "seed": config.seed,
                 **progress,

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import logging
+import os
 import time
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 
 from localizer.errors import ModelError
 from localizer.training.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.data.streams import open_stream
-from localizer.training.distributed import TrainingProcess
-from localizer.training.loop.log import append
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 
@@ -79,7 +82,7 @@ class Trainer:
         if steps is not None:
             last = min(last, self.step + steps)
         self.config.output.mkdir(parents=True, exist_ok=True)  # its error now, not after hours
-        stream = open_stream(self.config, self.workers, generating)
+        stream = open_stream(self.config, self.workers.rank, self.workers.count, generating)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
         core_began = time.process_time() - self.core_seconds
@@ -222,3 +225,55 @@ def perturbed_poses(batch: Batch, error_px: float, generator: torch.Generator) -
     angle = error_px / batch.K_query[:, 0]
     size = torch.stack([angle * depth] * 3 + [angle] * 3, 1)
     return se3_exp(xi * size) @ batch.query_from_reference
+
+
+def append(log: Path, row: Mapping[str, float]) -> None:
+    """Append a row to a run's CSV; writes the header first if the file is new."""
+    new = not log.exists()
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row.keys())
+        if new:
+            writer.writeheader()
+        writer.writerow({name: f"{value:.5g}" for name, value in row.items()})
+
+
+@dataclass(frozen=True)
+class TrainingProcess:
+    """This process's rank among `count`, and its device."""
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @classmethod
+    def from_environment(cls) -> TrainingProcess:
+        """Join the group that torchrun describes in RANK, WORLD_SIZE and LOCAL_RANK, if any."""
+        cuda = torch.cuda.is_available()
+        count = int(os.environ.get("WORLD_SIZE", "1"))
+        local = int(os.environ.get("LOCAL_RANK", "0"))
+        device = torch.device(f"cuda:{local}" if cuda else "cpu")
+        if count == 1:
+            return cls(0, 1, device)
+        if cuda:
+            torch.cuda.set_device(device)
+        if not dist.is_initialized():
+            dist.init_process_group("nccl" if cuda else "gloo")
+        return cls(dist.get_rank(), count, device)
+
+    def average_gradients(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Replace every process's gradients by their mean, so that all take the same step.
+
+        All gradients are sent as one message: the networks are small, so overlapping with the
+        backward pass would gain nothing.
+        """
+        if self.count == 1:
+            return
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        flat = torch.cat([g.flatten() for g in gradients])
+        dist.all_reduce(flat)
+        flat /= self.count
+        for gradient, mean in zip(
+            gradients, flat.split([g.numel() for g in gradients]), strict=True
+        ):
+            gradient.copy_(mean.view_as(gradient))

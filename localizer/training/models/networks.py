@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 from pydantic import Discriminator, Tag
+from torch import nn
 
-from localizer.training.models import s0 as model_s0
-from localizer.training.models import tiny as model
-from localizer.training.models.s0 import S0Config, S0Net
-from localizer.training.models.tiny import ModelConfig, TinyNet
+from localizer.training.models.s0 import BranchedBlock, S0Config, S0Net
+from localizer.training.models.tiny import MobileOneBlock, ModelConfig, TinyNet, folded_branch
 
 Network = TinyNet | S0Net
 
@@ -31,10 +30,20 @@ def build(config: ModelConfig | S0Config) -> Network:
     return S0Net(config) if isinstance(config, S0Config) else TinyNet(config)
 
 
-def fuse(network: Network) -> Network:
-    """Fold training's branches into single convolutions, in place; the function stays the same."""
-    if isinstance(network, S0Net):
-        model_s0.fuse(network)
-    else:
-        model.fuse(network)
+def fuse(network: nn.Module) -> nn.Module:
+    """Fold training's branches and batch normalisations into single convolutions, in place; the
+    function stays the same.
+    """
+    for name, child in network.named_children():
+        if isinstance(child, MobileOneBlock | BranchedBlock):
+            setattr(network, name, child.fused())
+        else:
+            fuse(child)
+    if isinstance(network, nn.Sequential) and any(
+        isinstance(child, nn.BatchNorm2d) for child in network
+    ):  # of s0's decoder
+        weight, bias = folded_branch(network)
+        network[0] = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
+        network[0].weight, network[0].bias = (nn.Parameter(v.detach()) for v in (weight, bias))
+        network[1] = nn.Identity()
     return network

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from localizer.training.models.tiny import affine
+from localizer.training.models.tiny import affine, fused_convolution
 
 STRIDES = (4, 2, 1)
 _WIDTHS, _BLOCKS = (48, 48, 128), (1, 2, 8)
@@ -50,7 +50,7 @@ class BranchedBlock(nn.Module):
         groups: int = 1,
     ) -> None:
         super().__init__()
-        self.shape = (inputs, outputs, size, stride, groups)
+        self.shape = (inputs, outputs, size, stride, groups, 1)
 
         def branch(k: int) -> nn.Sequential:
             conv = nn.Conv2d(inputs, outputs, k, stride, k // 2, groups=groups, bias=False)
@@ -71,24 +71,9 @@ class BranchedBlock(nn.Module):
 
     def fused(self) -> nn.Sequential:
         """The same function, with the evaluation's statistics, as one convolution and a ReLU."""
-        inputs, outputs, size, stride, groups = self.shape
-        conv = nn.Conv2d(inputs, outputs, size, stride, size // 2, groups=groups)
-        weight, bias = torch.zeros_like(conv.weight), torch.zeros(outputs)
-        for branch in (*self.convolutions, *([self.point] if self.point is not None else [])):
-            gain, shift = affine(branch[1])
-            folded = branch[0].weight * gain[:, None, None, None]
-            margin = (size - folded.shape[-1]) // 2
-            weight = weight + F.pad(folded, (margin, margin, margin, margin))
-            bias = bias + shift
-        if self.skip is not None:
-            gain, shift = affine(self.skip)
-            index = torch.arange(outputs)
-            identity = torch.zeros_like(weight)
-            identity[index, index % (inputs // groups), size // 2, size // 2] = gain
-            weight, bias = weight + identity, bias + shift
-        conv.weight = nn.Parameter(weight.detach().clone())
-        conv.bias = nn.Parameter(bias.detach().clone())
-        return nn.Sequential(conv, nn.ReLU())
+        branches = [*self.convolutions, *([self.point] if self.point is not None else [])]
+        gain, shift = (None, 0.0) if self.skip is None else affine(self.skip)
+        return fused_convolution(self.shape, branches, gain, shift)
 
 
 class S0Net(nn.Module):
@@ -142,24 +127,6 @@ class S0Net(nn.Module):
             unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
             levels.append((unit, 1.0 - torch.sigmoid(doubt(x).float())[:, 0]))
         return levels
-
-
-def fuse(model: nn.Module) -> nn.Module:
-    """Fold branches and batch normalisations into single convolutions, in place."""
-    for name, child in model.named_children():
-        if isinstance(child, BranchedBlock):
-            setattr(model, name, child.fused())
-        else:
-            fuse(child)
-    if isinstance(model, nn.Sequential) and len(model) > 1 and isinstance(model[1], nn.BatchNorm2d):
-        conv, bn = model[0], model[1]
-        assert isinstance(conv, nn.Conv2d)
-        gain, shift = affine(bn)
-        folded = nn.Conv2d(conv.in_channels, conv.out_channels, 3, padding=1)
-        folded.weight = nn.Parameter((conv.weight * gain[:, None, None, None]).detach().clone())
-        folded.bias = nn.Parameter(shift.detach().clone())
-        model[0], model[1] = folded, nn.Identity()
-    return model
 
 
 def _unit(inputs: int, outputs: int, branches: int, stride: int) -> list[nn.Module]:

@@ -12,6 +12,7 @@ of view costs next to nothing.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -71,25 +72,8 @@ class MobileOneBlock(nn.Module):
 
     def fused(self) -> nn.Sequential:
         """The same function as one convolution and a ReLU (evaluation statistics)."""
-        inputs, outputs, size, stride, groups, dilation = self.shape
-        fused = nn.Conv2d(
-            inputs,
-            outputs,
-            size,
-            stride,
-            dilation * (size // 2),
-            groups=groups,
-            dilation=dilation,
-        )
-        weight, bias = _folded(self.main)
-        if self.residual:
-            index = torch.arange(outputs)
-            identity = torch.zeros_like(weight)
-            identity[index, index % (inputs // groups), size // 2, size // 2] = 1.0
-            weight = weight + identity
-        fused.weight = nn.Parameter(weight.detach().clone())
-        fused.bias = nn.Parameter(bias.detach().clone())
-        return nn.Sequential(fused, nn.ReLU())
+        gain = torch.ones(self.shape[1]) if self.residual else None
+        return fused_convolution(self.shape, [self.main], gain, 0.0)
 
 
 class TinyNet(nn.Module):
@@ -138,19 +122,32 @@ class TinyNet(nn.Module):
         return levels
 
 
-def fuse(model: nn.Module) -> nn.Module:
-    """Replace every MobileOne block by its single convolution, in place; returns the model."""
-    for name, child in model.named_children():
-        if isinstance(child, MobileOneBlock):
-            setattr(model, name, child.fused())
-        else:
-            fuse(child)
-    return model
-
-
-def parameter_count(model: nn.Module) -> int:
-    """Number of learned values."""
-    return sum(p.numel() for p in model.parameters())
+def fused_convolution(
+    shape: tuple[int, ...],
+    branches: Iterable[nn.Module],
+    skip: Tensor | None,
+    shift: Tensor | float,
+) -> nn.Sequential:
+    """One convolution and a ReLU that give the ReLU of a sum: of `branches`, each a convolution and
+    a batch normalisation in evaluation, and of the input times `skip` (outputs,) plus `shift`.
+    shape: inputs, outputs, size, stride, groups, dilation.
+    """
+    inputs, outputs, size, stride, groups, dilation = shape
+    conv = nn.Conv2d(
+        inputs, outputs, size, stride, dilation * (size // 2), groups=groups, dilation=dilation
+    )
+    weight, bias = torch.zeros_like(conv.weight), torch.zeros(outputs) + shift
+    for branch in branches:
+        assert isinstance(branch, nn.Sequential)
+        folded, moved = folded_branch(branch)
+        margin = (size - folded.shape[-1]) // 2
+        weight, bias = weight + F.pad(folded, (margin,) * 4), bias + moved
+    if skip is not None:
+        index = torch.arange(outputs)
+        weight[index, index % (inputs // groups), size // 2, size // 2] += skip
+    conv.weight = nn.Parameter(weight.detach().clone())
+    conv.bias = nn.Parameter(bias.detach().clone())
+    return nn.Sequential(conv, nn.ReLU())
 
 
 def _pair(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1) -> list[nn.Module]:
@@ -178,7 +175,8 @@ def affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
     return gain, bn.bias - bn.running_mean * gain
 
 
-def _folded(branch: nn.Sequential) -> tuple[Tensor, Tensor]:
+def folded_branch(branch: nn.Sequential) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a convolution that its batch normalisation follows, in evaluation."""
     gain, shift = affine(branch[1])
     return branch[0].weight * gain[:, None, None, None], shift
 

@@ -8,10 +8,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from localizer.synth.heightfield.scene import Land, Prism
-from localizer.synth.visits.noise import noise
-from localizer.synth.visits.texture import hard_surfaces
-from localizer.training.places.objects import building, buildings_along, plant, with_ground_color
-from localizer.training.places.place import TrainingPlace
+from localizer.synth.visits.texture import hard_surfaces, noise
+from localizer.training.places.objects import (
+    TrainingPlace,
+    building,
+    buildings_along,
+    plant,
+    with_ground_color,
+)
 from localizer.types import Float32
 
 # RGB albedo of the land-cover classes: grass, crop, forest floor, soil, water, meadow.

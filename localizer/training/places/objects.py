@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.synth.heightfield.scene import Prism
-from localizer.training.places.place import TrainingPlace
+from localizer.synth.heightfield.scene import Land, Prism
 from localizer.types import Float32
+
+
+@dataclass(frozen=True)
+class TrainingPlace:
+    """A training place: ground, prisms (buildings and plants) on it and roads. seasons: albedos of
+    the same ground at other dates, where the data has them. lasting: (n, n) in 0..1, one where the
+    fine texture is the same at all dates: roads, roofs, pavement.
+    """
+
+    land: Land
+    prisms: list[Prism]
+    roads: list[Float32]
+    lasting: Float32
+    seasons: tuple[Float32, ...] = ()
 
 
 def parked_cars(rng: np.random.Generator, place: TrainingPlace, count: int) -> list[Prism]:

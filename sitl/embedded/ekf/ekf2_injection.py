@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sitl.embedded.ekf.injection import ExternalNavInput
+from sitl.embedded.ekf.injection import Clock, ExternalNavInput
 from sitl.embedded.ekf.measurements import ExternalPosition, ExternalVelocity
 from sitl.embedded.physics.rotation import euler, matrix
 from sitl.geodesy import Location
@@ -30,27 +30,28 @@ class RemoteClock:
         middle = (asked_us + now_us) // 2
         self._exchanges.append((now_us - asked_us, remote_us - middle))
 
-    def local_ms(self, remote_us: int, now_ms: int) -> int:
-        """Convert a sender's timestamp (µs) to ms since boot; now_ms before the first exchange."""
+    def correct(self, remote_us: int, local_us: int) -> int:
+        """Convert a sender's timestamp to µs since boot; local_us before the first exchange."""
         if not self._exchanges:
-            return now_ms
-        return (remote_us - min(self._exchanges)[1]) // 1000
+            return local_us
+        return remote_us - min(self._exchanges)[1]
 
 
 class Px4PositionInput(ExternalNavInput):
-    """Handles PX4's position messages; `vision` and `odometry` of ArduPilot are not called."""
+    """Handles PX4's position messages."""
 
-    def external_vision(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
+    def vision(self, message: Any, clock: Clock, now_ms: int) -> None:
         """Take VISION_POSITION_ESTIMATE, NED."""
-        stamp = clock.local_ms(message.usec, now_ms)
+        stamp = clock.correct(message.usec, now_ms * 1000) // 1000
         self._position(message, message.covariance, stamp, now_ms)
 
-    def external_odometry(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
+    def odometry(self, message: Any, clock: Clock, now_ms: int) -> None:
         """Take ODOMETRY in LOCAL_NED or LOCAL_FRD; the axes of LOCAL_FRD count as north and east.
         Other frames, and a quality below EKF2_EV_QMIN, are ignored. Of the velocity only one in
         BODY_FRD, turned by `q`, is used; the heading is not.
         """
-        p, stamp = self._parameters, clock.local_ms(message.time_usec, now_ms)
+        p = self._parameters
+        stamp = clock.correct(message.time_usec, now_ms * 1000) // 1000
         if message.frame_id not in (_LOCAL_NED, _LOCAL_FRD):
             return
         if message.quality < p["EKF2_EV_QMIN"]:
@@ -65,7 +66,7 @@ class Px4PositionInput(ExternalNavInput):
         velocity = ExternalVelocity((float(n), float(e), float(d)), max(sigma, p["EKF2_EVV_NOISE"]))
         self._estimator.add(velocity, stamp - int(p["EKF2_EV_DELAY"]))
 
-    def global_position(self, message: Any, clock: RemoteClock, now_ms: int) -> None:
+    def global_position(self, message: Any, clock: Clock, now_ms: int) -> None:
         """Take GLOBAL_POSITION_SENSOR with id EKF2_AGP0_ID; the first sets a missing origin."""
         p, estimator = self._parameters, self._estimator
         if message.id == 0 or message.id != p["EKF2_AGP0_ID"] or not int(p["EKF2_AGP0_CTRL"]) & 1:
@@ -75,7 +76,8 @@ class Px4PositionInput(ExternalNavInput):
             estimator.set_origin(where)
         if estimator.origin is None or not isfinite(message.eph):
             return
-        stamp = clock.local_ms(message.time_usec - message.processing_time, now_ms)
+        taken_us = message.time_usec - message.processing_time
+        stamp = clock.correct(taken_us, now_ms * 1000) // 1000
         sigma = max(message.eph, p["EKF2_AGP0_NOISE"], 0.01)
         fix = ExternalPosition(
             estimator.origin.ned_of(where), sigma, None, 0.0, False, is_global=True

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from math import isnan, radians
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.ekf.measurements import ExternalPosition, ExternalVelocity, GpsData
-from sitl.embedded.ekf.timesync import JitterCorrection
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics.rotation import euler, matrix, quaternion
 
@@ -32,6 +31,14 @@ _IGNORE_HORIZONTAL_ACCURACY = 64
 _NO_HDOP = 99.99
 
 
+class Clock(Protocol):
+    """Converts a sender's timestamps."""
+
+    def correct(self, remote_us: int, local_us: int) -> int:
+        """The time of a message's timestamp, µs since boot; local_us: of its arrival."""
+        ...
+
+
 class ExternalNavInput:
     """Handles the companion's position messages: vision, odometry and GPS_INPUT."""
 
@@ -51,7 +58,7 @@ class ExternalNavInput:
         """Whether a vision message arrived in the last 300 ms."""
         return now_ms - self._last_vision_ms < _VISION_TIMEOUT_MS
 
-    def vision(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
+    def vision(self, message: Any, clock: Clock, now_ms: int) -> None:
         """Take VISION_POSITION_ESTIMATE or GLOBAL_VISION_POSITION_ESTIMATE; both are read as local
         positions. VISO_TYPE 0 ignores them.
         """
@@ -62,17 +69,17 @@ class ExternalNavInput:
         if not any(isnan(a) for a in angles):
             yaw = euler(quaternion(*angles))[2]
         # The message carries no quality: any VISO_QUAL_MIN above 0 refuses it.
-        stamp = jitter.correct(message.usec, now_ms * 1000) // 1000
+        stamp = clock.correct(message.usec, now_ms * 1000) // 1000
         covariance = _covariance(message.covariance)
         self._pose(message, yaw=yaw, errors=covariance, stamp_ms=stamp, now_ms=now_ms, quality=0)
 
-    def odometry(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
+    def odometry(self, message: Any, clock: Clock, now_ms: int) -> None:
         """Take ODOMETRY in LOCAL_FRD with velocity in BODY_FRD; other frames are ignored."""
         if self._parameters["VISO_TYPE"] == 0:
             return
         if (message.frame_id, message.child_frame_id) != (_LOCAL_FRD, _BODY_FRD):
             return
-        stamp = jitter.correct(message.time_usec, now_ms * 1000) // 1000
+        stamp = clock.correct(message.time_usec, now_ms * 1000) // 1000
         q = np.array(message.q, dtype=np.float64)
         known = bool(np.all(np.isfinite(q)) and np.linalg.norm(q) > 0.1)
         yaw = euler(q)[2] if known else None
@@ -158,7 +165,7 @@ class ExternalNavInput:
             return False
         return (times[-1] - times[0]) / (len(times) - 1) <= _GPS_MAX_GAP_MS
 
-    def gps_input(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
+    def gps_input(self, message: Any, clock: Clock, now_ms: int) -> None:
         """Take GPS_INPUT of gps_id 0 or 1 if GPS1_TYPE or GPS2_TYPE, respectively, is 14; gps_id 1
         is fused only while the simulated receiver has no fix.
         """
@@ -174,7 +181,7 @@ class ExternalNavInput:
         stamp = now_ms
         if message.time_week > 0:
             remote = (message.time_week * 604_800_000 + message.time_week_ms) * 1000
-            stamp = jitter.correct(remote, now_ms * 1000) // 1000
+            stamp = clock.correct(remote, now_ms * 1000) // 1000
         self.gps = GpsData(
             message.lat / 1e7,
             message.lon / 1e7,

@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.control.mode import Mode
+from sitl.embedded.ekf.injection import Clock
 from sitl.embedded.mavlink.gimbal_commands import GimbalCommands
 from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
 from sitl.embedded.mavlink.navigation_commands import NavigationCommands
@@ -134,17 +135,21 @@ class Commands:
 
     # --- injection ---------------------------------------------------------------------------
 
+    def _clock(self, link: SerialPort) -> Clock:
+        """Of the link's sender."""
+        return link.jitter
+
     def _vision(self, link: SerialPort, message: Any) -> None:
-        self._vehicle.injection.vision(message, link.jitter, self._vehicle.time_ms)
+        self._vehicle.injection.vision(message, self._clock(link), self._vehicle.time_ms)
 
     def _odometry(self, link: SerialPort, message: Any) -> None:
-        self._vehicle.injection.odometry(message, link.jitter, self._vehicle.time_ms)
+        self._vehicle.injection.odometry(message, self._clock(link), self._vehicle.time_ms)
 
     def _position_delta(self, _link: SerialPort, message: Any) -> None:
         self._vehicle.injection.position_delta(message, self._vehicle.time_ms)
 
     def _gps_input(self, link: SerialPort, message: Any) -> None:
-        self._vehicle.injection.gps_input(message, link.jitter, self._vehicle.time_ms)
+        self._vehicle.injection.gps_input(message, self._clock(link), self._vehicle.time_ms)
 
     def _timesync(self, link: SerialPort, message: Any) -> None:
         if message.tc1 == 0:

@@ -11,6 +11,7 @@ from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.control.px4_modes import NUMBERS, custom_mode
 from sitl.embedded.ekf.ekf2_injection import Px4PositionInput, RemoteClock
+from sitl.embedded.ekf.injection import Clock
 from sitl.embedded.mavlink.commands import Commands
 from sitl.embedded.mavlink.handling import ACCEPTED, FAILED
 from sitl.embedded.mavlink.server import SerialPort
@@ -107,20 +108,10 @@ class Px4Commands(Commands):
             now_us = self._vehicle.time_ms * 1000
             self._clocks[link.name].add_exchange(message.tc1 // 1000, message.ts1 // 1000, now_us)
 
-    @property
-    def _input(self) -> Px4PositionInput:
-        taken = self._vehicle.injection
-        assert isinstance(taken, Px4PositionInput)
-        return taken
-
-    def _vision(self, link: SerialPort, message: Any) -> None:
-        clock, now_ms = self._clocks[link.name], self._vehicle.time_ms
-        self._input.external_vision(message, clock, now_ms)
-
-    def _odometry(self, link: SerialPort, message: Any) -> None:
-        clock, now_ms = self._clocks[link.name], self._vehicle.time_ms
-        self._input.external_odometry(message, clock, now_ms)
+    def _clock(self, link: SerialPort) -> Clock:
+        return self._clocks[link.name]
 
     def _global_position(self, link: SerialPort, message: Any) -> None:
-        clock, now_ms = self._clocks[link.name], self._vehicle.time_ms
-        self._input.global_position(message, clock, now_ms)
+        taken = self._vehicle.injection
+        assert isinstance(taken, Px4PositionInput)
+        taken.global_position(message, self._clock(link), self._vehicle.time_ms)

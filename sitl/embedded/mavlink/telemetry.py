@@ -13,6 +13,7 @@ from sitl.embedded.ekf.estimator import EkfFlags
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.physics.dynamics import GRAVITY
 from sitl.embedded.physics.rotation import euler
+from sitl.geodesy import Location
 
 FIRMWARE_VERSION = (4, 7, 0, 0)  # major, minor, patch, FIRMWARE_VERSION_TYPE_DEV
 _TYPE_QUADROTOR, _AUTOPILOT_ARDUPILOT = 2, 3
@@ -166,17 +167,13 @@ class TelemetryBuilder:
 
     def _global_position(self) -> Any:
         v = self._vehicle
-        here = v.estimator.location
-        latitude, longitude, altitude = (
-            (here.latitude_deg, here.longitude_deg, here.altitude_m) if here else (0.0, 0.0, 0.0)
-        )
-        above = altitude - v.modes.home.altitude_m if v.modes.home and here else 0.0
+        known = v.estimator.location
+        here = known or Location(0.0, 0.0, 0.0)
+        above = here.altitude_m - v.modes.home.altitude_m if v.modes.home and known else 0.0
         velocity = (round(c * 100) for c in v.estimator.velocity)
         return mavlink.MAVLink_global_position_int_message(
             v.time_ms,
-            round(latitude * 1e7),
-            round(longitude * 1e7),
-            round(altitude * 1000),
+            *_scaled(here),
             round(above * 1000),
             *velocity,
             self._heading_centidegrees(),
@@ -196,22 +193,19 @@ class TelemetryBuilder:
                 stamp, kind, 0, 0, 0, 9999, 65535, 0, 65535, 0
             )
         if injected is not None and v.parameters["GPS1_TYPE"] == 14:
-            latitude, longitude = injected.latitude_deg, injected.longitude_deg
-            altitude, satellites, hdop = injected.altitude_m, injected.satellites, injected.hdop
+            where = Location(injected.latitude_deg, injected.longitude_deg, injected.altitude_m)
+            satellites, hdop = injected.satellites, injected.hdop
             accuracy, kind = injected.horizontal_accuracy, 3
         else:
             if sample is None:
                 return None
             where = v.launch.offset(*(float(c) for c in sample.position))
-            latitude, longitude = where.latitude_deg, where.longitude_deg
-            altitude, satellites, hdop = where.altitude_m, sample.satellites, 1.2
+            satellites, hdop = sample.satellites, 1.2
             accuracy, kind = sample.horizontal_accuracy, 6
         return mavlink.MAVLink_gps_raw_int_message(
             stamp,
             kind,
-            round(latitude * 1e7),
-            round(longitude * 1e7),
-            round(altitude * 1000),
+            *_scaled(where),
             round(hdop * 100),
             65535,
             0,
@@ -248,7 +242,7 @@ class TelemetryBuilder:
         v = self._vehicle
         where, x = v.true_location, v.truth
         q = [float(c) for c in x[6:10]]
-        latitude, longitude = round(where.latitude_deg * 1e7), round(where.longitude_deg * 1e7)
+        latitude, longitude, _ = _scaled(where)
         return mavlink.MAVLink_sim_state_message(
             *q,
             *euler(x[6:10]),
@@ -271,10 +265,7 @@ class TelemetryBuilder:
         if origin is None:
             return None
         return mavlink.MAVLink_gps_global_origin_message(
-            round(origin.latitude_deg * 1e7),
-            round(origin.longitude_deg * 1e7),
-            round(origin.altitude_m * 1000),
-            self._vehicle.time_ms * 1000,
+            *_scaled(origin), self._vehicle.time_ms * 1000
         )
 
     def _home(self) -> Any | None:
@@ -283,9 +274,7 @@ class TelemetryBuilder:
         if home is None or v.estimator.origin is None:
             return None
         return mavlink.MAVLink_home_position_message(
-            round(home.latitude_deg * 1e7),
-            round(home.longitude_deg * 1e7),
-            round(home.altitude_m * 1000),
+            *_scaled(home),
             *v.estimator.origin.ned_of(home),
             [1.0, 0.0, 0.0, 0.0],
             0.0,
@@ -333,3 +322,12 @@ class TelemetryBuilder:
         return mavlink.MAVLink_gimbal_manager_information_message(
             v.time_ms, capabilities, 1, *limits
         )
+
+
+def _scaled(where: Location) -> tuple[int, int, int]:
+    """Degrees * 1e7, degrees * 1e7 and millimetres, as messages carry them."""
+    return (
+        round(where.latitude_deg * 1e7),
+        round(where.longitude_deg * 1e7),
+        round(where.altitude_m * 1000),
+    )

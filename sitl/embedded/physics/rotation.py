@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mavlink_bridge.quaternion import from_euler, to_euler
 
 Array = NDArray[np.float64]
+Quaternion = tuple[float, float, float, float]
 
 
 @njit(cache=True)
@@ -33,31 +34,31 @@ def matrix(q: Array) -> Array:
 @njit(cache=True)
 def rotate_body(q: Array, rx: float, ry: float, rz: float) -> None:
     """``q <- q * exp(r)`` in place: a rotation vector in body axes, radians."""
-    angle = sqrt(rx * rx + ry * ry + rz * rz)
-    s = 0.5 if angle < 1e-9 else sin(0.5 * angle) / angle
-    c, bx, by, bz = cos(0.5 * angle), s * rx, s * ry, s * rz
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    a = w * c - x * bx - y * by - z * bz
-    b = w * bx + x * c + y * bz - z * by
-    d = w * by - x * bz + y * c + z * bx
-    e = w * bz + x * by - y * bx + z * c
-    n = 1.0 / sqrt(a * a + b * b + d * d + e * e)
-    q[0], q[1], q[2], q[3] = a * n, b * n, d * n, e * n
+    _multiply((q[0], q[1], q[2], q[3]), _exp(rx, ry, rz), q)
 
 
 @njit(cache=True)
 def rotate_world(q: Array, rx: float, ry: float, rz: float) -> None:
     """``q <- exp(r) * q`` in place: a rotation vector in NED axes, radians."""
+    _multiply(_exp(rx, ry, rz), (q[0], q[1], q[2], q[3]), q)
+
+
+@njit(cache=True)
+def _exp(rx: float, ry: float, rz: float) -> Quaternion:
     angle = sqrt(rx * rx + ry * ry + rz * rz)
     s = 0.5 if angle < 1e-9 else sin(0.5 * angle) / angle
-    c, bx, by, bz = cos(0.5 * angle), s * rx, s * ry, s * rz
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    a = c * w - bx * x - by * y - bz * z
-    b = c * x + bx * w + by * z - bz * y
-    d = c * y - bx * z + by * w + bz * x
-    e = c * z + bx * y - by * x + bz * w
-    n = 1.0 / sqrt(a * a + b * b + d * d + e * e)
-    q[0], q[1], q[2], q[3] = a * n, b * n, d * n, e * n
+    return cos(0.5 * angle), s * rx, s * ry, s * rz
+
+
+@njit(cache=True)
+def _multiply(p: Quaternion, q: Quaternion, out: Array) -> None:
+    """The product of two quaternions, normalised."""
+    a = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
+    b = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
+    c = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
+    d = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]
+    n = 1.0 / sqrt(a * a + b * b + c * c + d * d)
+    out[0], out[1], out[2], out[3] = a * n, b * n, c * n, d * n
 
 
 def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:

@@ -12,8 +12,8 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import StrictModel
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
-from sitl.demo.scenario import CameraSpec, Scenario, ScenarioError, ScenarioLeg
-from sitl.suite.case import load_case
+from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
+from sitl.suite.case import load_all, require_known
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.ramp import Ramp
 
@@ -221,14 +221,9 @@ def load_loop_cases(
     """Load all scenarios of a folder, or those named. The name ``normal`` stands for all flights
     without a fault. Raises `ScenarioError` for an invalid file or an unknown name.
     """
-    files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-    if not files:
-        raise ScenarioError(f"{folder}: holds no flights (NAME.yaml)")
-    cases = {name: load_case(path, LoopCase) for name, path in files.items()}
+    cases = load_all(folder, LoopCase)
     groups = {"normal": tuple(name for name, case in cases.items() if case.is_normal)}
-    chosen = list(names) or list(files)
-    unknown = [name for name in chosen if name not in cases and name not in groups]
-    if unknown:
-        raise ScenarioError(f"no {', '.join(unknown)} in {folder}; there are: {', '.join(files)}")
+    chosen = list(names) or list(cases)
+    require_known(chosen, [*cases, *groups], folder)
     wanted = [single for name in chosen for single in groups.get(name, (name,))]
     return tuple(cases[name] for name in dict.fromkeys(wanted))

@@ -6,8 +6,8 @@ import os
 import subprocess
 import sys
 
+from sitl.demo.companion_process import FlightCompanion
 from sitl.suite.loop.case import Load
-from sitl.suite.loop.companion import LoopCompanion
 
 # Computes until its time is over: a process that outlived the flight would disturb the next one.
 _BURNER = """
@@ -21,7 +21,7 @@ while time.monotonic() < end:
 class CpuLoad:
     """CPU load from now on: busy processes that share one processor with the companion."""
 
-    def __init__(self, load: Load, companion: LoopCompanion) -> None:
+    def __init__(self, load: Load, companion: FlightCompanion) -> None:
         self._companion = companion
         self._all = os.sched_getaffinity(0)
         one = {min(self._all)}

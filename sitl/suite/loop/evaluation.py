@@ -12,9 +12,9 @@ import numpy as np
 
 from mavlink_bridge.alerts.catalogue import spec_of
 from mavlink_bridge.alerts.ids import AlertId
+from sitl.demo.companion_process import Health
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop.case import Expectation
-from sitl.suite.loop.companion import Health
 from sitl.suite.record import Text
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
@@ -174,48 +174,37 @@ def evaluate(
     no false alarm.
     """
     samples, flown = record.samples, figures(record, expect.beyond_m)
-    held = [
-        LoopExpectationResult(
-            f"beyond {expect.beyond_m:g} m reported within {expect.told_within_s:g} s",
-            bool(samples) and flown.untold_s <= expect.told_within_s,
-            f"unreported for {flown.untold_s:.1f} s at most; error up to {flown.max_error_m:.1f} m",
-        )
-    ]
+    held: list[LoopExpectationResult] = []
+
+    def hold(what: str, ok: bool, seen: str) -> None:
+        held.append(LoopExpectationResult(what, ok, seen))
+
+    hold(
+        f"beyond {expect.beyond_m:g} m reported within {expect.told_within_s:g} s",
+        bool(samples) and flown.untold_s <= expect.told_within_s,
+        f"unreported for {flown.untold_s:.1f} s at most; error up to {flown.max_error_m:.1f} m",
+    )
     for mode in expect.never_modes:
         seen = [s.at_s for s in samples if s.mode == mode]
-        held.append(
-            LoopExpectationResult(
-                f"never {mode}", not seen, f"from {seen[0]:.0f} s" if seen else "never"
-            )
-        )
+        hold(f"never {mode}", not seen, f"from {seen[0]:.0f} s" if seen else "never")
     if expect.max_error_m is not None:
         ok = flown.max_error_m <= expect.max_error_m
-        held.append(
-            LoopExpectationResult(
-                f"EKF within {expect.max_error_m:g} m", ok, f"{flown.max_error_m:.1f} m"
-            )
-        )
+        hold(f"EKF within {expect.max_error_m:g} m", ok, f"{flown.max_error_m:.1f} m")
     if expect.false_fixes is not None:
         ok = flown.false <= expect.false_fixes and (flown.sent > 0 or not expect.injects)
-        held.append(
-            LoopExpectationResult("false fixes injected", ok, f"{flown.false} of {flown.sent}")
-        )
+        hold("false fixes injected", ok, f"{flown.false} of {flown.sent}")
     if record.shadow is not None:
-        held.append(
-            LoopExpectationResult("shadow check passed", record.shadow.ready, record.shadow.shadow)
-        )
+        hold("shadow check passed", record.shadow.ready, record.shadow.shadow)
     if expect.back_within_s is not None:
         back = record.back or RestartTimes(math.inf, math.inf, math.inf)
-        ok = back.injects_s <= expect.back_within_s
         found = f"estimate after {back.estimates_s:.1f} s, tracks {back.tracks_s:.1f}"
         found += f", injects {back.injects_s:.1f}"
-        held.append(LoopExpectationResult(f"back within {expect.back_within_s:g} s", ok, found))
+        ok = back.injects_s <= expect.back_within_s
+        hold(f"back within {expect.back_within_s:g} s", ok, found)
     if expect.ends_tracking:
         last = samples[-1] if samples else None
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
-        held.append(
-            LoopExpectationResult("tracks at the end", ok, last.health if last else "no samples")
-        )
+        hold("tracks at the end", ok, last.health if last else "no samples")
     held += [_reported(record, of) for of in expect.reports]
     held += [_timed(record.texts, of) for of in expect.alerts]
     if expect.warns_first is not None:
@@ -224,7 +213,7 @@ def evaluate(
         held.append(_repeated(record.texts, expect.repeats))
     if expect.silent:
         told = false_alarms(record, denied=denied)
-        held.append(LoopExpectationResult("no warning", not told, "; ".join(told) or "none"))
+        hold("no warning", not told, "; ".join(told) or "none")
     return tuple(held)
 
 

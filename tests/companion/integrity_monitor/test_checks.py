@@ -38,7 +38,7 @@ def frozen(path: Path, since_s: float) -> Path:
 
 
 @pytest.mark.parametrize("path", [hover, leg])
-@pytest.mark.parametrize("noise_m", [0.02, 0.5, 2.0])
+@pytest.mark.parametrize("noise_m", [0.02, 2.0])
 def test_an_honest_flight_is_left_alone(path: Path, noise_m: float) -> None:
     """Neither a hover nor a start to 10 m/s costs a fix or a text."""
     flight = Flight(monitor(), path, noise_m=noise_m, claimed_m=noise_m).fly(40.0)
@@ -47,13 +47,21 @@ def test_an_honest_flight_is_left_alone(path: Path, noise_m: float) -> None:
     assert len(flight.passed) == 400
 
 
-def test_a_position_that_freezes_in_flight_is_told_within_two_seconds() -> None:
-    """At 10 m/s: the IMU felt nothing that would have stopped the aircraft."""
-    flight = Flight(monitor(), leg, frozen(leg, 12.0), noise_m=0.03).fly(40.0)
+def test_a_position_that_freezes_in_flight_is_told_within_two_seconds_and_believed_again() -> None:
+    """At 10 m/s: the IMU felt nothing that would have stopped the aircraft. The EKF holds what was
+    wrong: the first fix afterwards must not be fought.
+    """
+
+    def thaws(at_s: float) -> tuple[float, float]:
+        return leg(12.0 if 12.0 < at_s < 16.0 else at_s)
+
+    flight = Flight(monitor(), leg, thaws, noise_m=0.03).fly(60.0)
     assert flight.told(AlertId.VISION_IMU_MISMATCH) < 14.0
-    assert max(flight.held) > 39.0
     assert min(flight.held) < 14.0
-    assert not [fix for fix in flight.passed if fix.time_ns > 14.5e9]
+    assert not [fix for fix in flight.passed if 14.5e9 < fix.time_ns < 16e9]
+    assert 16.0 < flight.ended(AlertId.VISION_IMU_MISMATCH) < 55.0
+    back = [fix for fix in flight.passed if fix.time_ns > 16e9]
+    assert jumps(flight) == [back[0].time_ns * 1e-9]
 
 
 @dataclass
@@ -106,18 +114,6 @@ def test_low_light_is_told_after_2_s_and_ends_after_5_s_and_holds_nothing() -> N
     assert 19.0 <= flight.ended(AlertId.LOW_CONTRAST) <= 19.4
     assert {one.id for _, one in flight.lines} == {AlertId.LOW_CONTRAST}
     assert flight.held == []
-
-
-def test_what_moves_again_is_believed_again_with_a_reset() -> None:
-    """The EKF holds what was wrong: the first fix afterwards must not be fought."""
-
-    def thaws(at_s: float) -> tuple[float, float]:
-        return leg(12.0 if 12.0 < at_s < 16.0 else at_s)
-
-    flight = Flight(monitor(), leg, thaws, noise_m=0.03).fly(60.0)
-    assert 16.0 < flight.ended(AlertId.VISION_IMU_MISMATCH) < 55.0
-    back = [fix for fix in flight.passed if fix.time_ns > 16e9]
-    assert jumps(flight) == [back[0].time_ns * 1e-9]
 
 
 def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
@@ -180,23 +176,20 @@ def test_a_step_aside_is_settled_where_the_place_is_found_anew() -> None:
 
 @pytest.mark.parametrize("accuracy_m", [1.0, 12.0])
 def test_gnss_apart_from_vision_is_told_as_long_as_it_lasts(accuracy_m: float) -> None:
-    """However bad the receiver claims to be: 12 m times a number of sigma would excuse 60 m."""
-    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0, gnss_accuracy_m=accuracy_m).fly(35.0)
+    """However bad the receiver claims to be: 12 m times a number of sigma would excuse 60 m. One
+    that is gone is not told as apart for the rest of the flight.
+    """
+    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0, gnss_accuracy_m=accuracy_m).fly(15.0)
     told = flight.times(AlertId.GNSS_VISION_MISMATCH)
     assert told[0] < 4.0
-    assert np.diff(told) == pytest.approx(10.0, abs=0.5)
-    assert len(told) == 4
-    assert flight.held == []  # neither is said to be right
-
-
-def test_gnss_that_is_gone_is_not_told_as_apart_for_the_rest_of_the_flight() -> None:
-    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0).fly(6.0)
-    told = len(flight.lines)
-    assert told == 1
+    assert np.diff(told) == pytest.approx([10.0], abs=0.5)
     flight.gnss_north_m = None
-    assert len(flight.fly(30.0).lines) == told
+    assert len(flight.fly(40.0).lines) == 2
     flight.gnss_north_m = lambda _: 20.0  # and as soon as it is there again, it is
-    assert len(flight.fly(32.0).lines) == told + 1
+    assert len(flight.fly(42.0).lines) == 3
+    assert flight.held == []  # neither is said to be right
+    ours = Flight(monitor(gnss_is_ours=True), gnss_north_m=lambda _: 20.0).fly(10.0)
+    assert ours.lines == []  # agreement or not with what we fed ourselves is no evidence
 
 
 def test_a_receiver_that_lags_is_left_alone_and_a_dragged_one_is_told_at_speed() -> None:
@@ -214,11 +207,6 @@ def test_a_receiver_that_lags_is_left_alone_and_a_dragged_one_is_told_at_speed()
     assert 0.6 * (dragged.fly(40.0).told(AlertId.GNSS_VISION_MISMATCH) - 10.0) < 10.0
 
 
-def test_our_own_gps_input_is_no_gnss() -> None:
-    """Agreement or not with what we fed ourselves is no evidence."""
-    assert Flight(monitor(gnss_is_ours=True), gnss_north_m=lambda _: 20.0).fly(10.0).lines == []
-
-
 class Twice(Flight):
     """Two flights of one process, on the ground from 20 to 40 s; meanwhile the weather changed."""
 
@@ -233,22 +221,19 @@ class Twice(Flight):
         )
 
 
-def test_the_weather_between_two_flights_is_no_finding() -> None:
+def test_the_weather_between_two_flights_is_no_finding_and_a_height_is_watched_anew() -> None:
     """2 hPa in some hours are 17 m: the second flight was withheld from its first position on, and
     to its end, because the zero of the first stood while it was off.
     """
-    flight = Twice(monitor()).fly(60.0)
+    flight = Twice(monitor()).fly(50.0)
     assert flight.lines == []
     assert flight.held == []
 
-
-def test_a_height_that_was_off_in_one_flight_is_watched_anew_in_the_next() -> None:
     def height(at_s: float) -> float:
         return 30.0 if 10.0 <= at_s < 20.0 or at_s >= 50.0 else 0.0
 
-    flight = Twice(monitor(), height_m=height).fly(60.0)
-    told = flight.times(AlertId.HEIGHT_MISMATCH)
-    assert told == pytest.approx([12.8, 52.8], abs=1.0)
+    flight = Twice(monitor(), height_m=height).fly(55.0)
+    assert flight.times(AlertId.HEIGHT_MISMATCH) == pytest.approx([12.8, 52.8], abs=1.0)
     assert not [at_s for at_s in flight.held if 27.0 < at_s < 50.0]
 
 
@@ -269,30 +254,17 @@ class InAir(Flight):
         return replace(super().state(), pressure_altitude_m=500.0 + standard)
 
 
-@pytest.mark.parametrize("celsius", [-25.0, 0.0, 45.0])
-def test_a_climb_through_cold_or_hot_air_is_no_finding(celsius: float) -> None:
+@pytest.mark.parametrize("celsius", [-25.0, 45.0])
+def test_a_climb_through_cold_or_hot_air_is_no_finding_and_half_of_one_is(celsius: float) -> None:
     """At -25 degrees 100 m are 116 by the barometer: withheld at 60 m, and for the whole flight,
-    because its zero stands while it is off.
+    because its zero stands while it is off. Who sees 50 m of 100 sees another place's ground.
     """
-    flight = InAir(monitor(), height_m=climb, celsius=celsius).fly(60.0)
+    flight = InAir(monitor(), height_m=climb, celsius=celsius).fly(40.0)
     assert flight.lines == []
     assert flight.held == []
-
-
-@pytest.mark.parametrize("celsius", [-25.0, 45.0])
-def test_a_climb_that_vision_makes_half_is_withheld_in_any_air(celsius: float) -> None:
-    """It saw 50 m of 100: another place's ground."""
-    flight = InAir(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
+    flight = InAir(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(40.0)
     assert flight.told(AlertId.HEIGHT_MISMATCH) < 21.0
-    assert max(flight.held) > 59.0
-
-
-def test_beyond_the_alert_limit_nothing_is_injected() -> None:
-    """A sigma of 3 m is honest, and too much for the risk."""
-    flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
-    assert flight.told(AlertId.HPL_OVER_LIMIT) <= 3.0
-    assert max(flight.held) > 9.8
-    assert flight.moved == []
+    assert max(flight.held) > 39.0
 
 
 def around(at_s: float, scale: float = 1.0) -> tuple[float, float]:
@@ -335,7 +307,8 @@ def test_the_alert_limit_is_told_within_the_time_to_alert(raise_s: float) -> Non
     flight.claimed_m = 0.3
     flight.fly(15.6)
     assert 15.0 <= flight.ended(AlertId.HPL_OVER_LIMIT) < 15.5  # 3 s below it, or it would flap
-    assert max(flight.held) < 15.5
+    assert 11.8 < max(flight.held) < 15.5
+    assert flight.moved == []
 
 
 def test_an_alert_limit_that_is_touched_now_and_then_does_not_flap() -> None:

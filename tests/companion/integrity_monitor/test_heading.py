@@ -19,6 +19,7 @@ from tests.companion.integrity_monitor.simulated import (
     jumps,
     monitor,
     taken,
+    turned,
 )
 
 Angle = Callable[[float], float]
@@ -68,11 +69,7 @@ def turns(degrees: float, until_s: float) -> tuple[Path, Angle]:
     def angle(at_s: float) -> float:
         return degrees if 12.0 <= at_s < until_s else 0.0
 
-    def seen(at_s: float) -> tuple[float, float]:
-        (north, east), a = away(at_s), np.radians(angle(at_s))
-        return north * np.cos(a) - east * np.sin(a), north * np.sin(a) + east * np.cos(a)
-
-    return seen, angle
+    return turned(away, 12.0, until_s, degrees), angle
 
 
 @pytest.mark.parametrize(("degrees", "silent_s"), [(3.0, 0.0), (-5.0, 6.0)])

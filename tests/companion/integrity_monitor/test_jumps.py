@@ -19,6 +19,7 @@ from tests.companion.integrity_monitor.simulated import (
     monitor,
     swung,
     taken,
+    turned,
 )
 
 Velocity = tuple[float, float]
@@ -41,22 +42,6 @@ class Reckoned(Flight):
 def cruise(at_s: float) -> tuple[float, float]:
     """10 m/s northwards."""
     return 10.0 * at_s, 0.0
-
-
-def turned(path: Path, from_s: float, until_s: float, degrees: float = 5.0) -> Path:
-    """What a frame shows that turns about home for a while."""
-    angle = np.radians(degrees)
-
-    def seen(at_s: float) -> tuple[float, float]:
-        north, east = path(at_s)
-        if not from_s <= at_s < until_s:
-            return north, east
-        return (
-            north * np.cos(angle) - east * np.sin(angle),
-            north * np.sin(angle) + east * np.cos(angle),
-        )
-
-    return seen
 
 
 def drifting(since_s: float) -> Callable[[float], Velocity]:

@@ -86,23 +86,13 @@ def test_it_holds_until_good_evidence_lasts() -> None:
     assert not debouncer.raised
 
 
-def test_silence_is_no_good_evidence() -> None:
-    """Good once, then nothing for long, then good once more does not release it."""
+def test_silence_is_evidence_neither_of_a_fault_nor_of_its_end() -> None:
+    """Bad, or good, once, then nothing for long, then once more has not lasted."""
     debouncer = AlertDebouncer(rule())
-    debouncer.update(0, BAD)
-    debouncer.update(SECOND, BAD)
-    debouncer.update(2 * SECOND, GOOD)
-    for k in range(3, 10):
-        debouncer.update(k * SECOND, UNKNOWN)
-    assert debouncer.update(10 * SECOND, GOOD) is None
-    assert debouncer.raised
-    assert debouncer.update(12 * SECOND, GOOD) == OVER
-
-
-def test_silence_is_no_evidence_of_a_fault() -> None:
-    """Bad, then nothing for long, then bad again is not a fault that lasted."""
-    debouncer = AlertDebouncer(rule())
-    debouncer.update(0, BAD)
-    for k in range(1, 10):
-        debouncer.update(k * SECOND, UNKNOWN)
-    assert debouncer.update(10 * SECOND, BAD) is None
+    for begun, found in ((0, BAD), (20, GOOD)):
+        debouncer.update(begun * SECOND, found)
+        for k in range(1, 10):
+            debouncer.update((begun + k) * SECOND, UNKNOWN)
+        assert debouncer.update((begun + 10) * SECOND, found) is None
+        lasted = debouncer.update((begun + 12) * SECOND, found)
+        assert lasted == (RAISED if found is BAD else OVER)

@@ -87,13 +87,6 @@ def test_the_same_picture_is_told_from_one_that_stands_still() -> None:
     assert watch([camera.look(0.0, 0.0) for _ in range(30)])[-1].identical_s == 0.0
 
 
-def test_what_shows_nothing_is_no_evidence() -> None:
-    """Fog: nobody can say whether it stands still; the localizer sees nothing either."""
-    fog = np.full((800, 1000, 3), 128, np.uint8)
-    camera = Camera(fog, noise=2.0)
-    assert max(v.still_s for v in watch([camera.look(*sway(k)) for k in range(50)])) < 1.0
-
-
 def test_what_comes_after_a_covered_lens_is_new() -> None:
     """Any picture is a covered one's times a gain: it passed for frozen, then for a loop, and right
     fixes were withheld for 13 s (the flight covered-10s, seed 1).

@@ -36,17 +36,14 @@ def test_recall_needs_both_errors_within_and_counts_missing_frames_as_failed():
     assert m.fps == 2.0
 
 
-def test_no_estimate_at_all_is_not_a_perfect_score():
-    m = localization_metrics(np.full(3, np.nan), np.full(3, np.nan), 1.0)
+@pytest.mark.parametrize("frames", [3, 0])
+def test_no_estimate_at_all_is_not_a_perfect_score(frames):
+    m = localization_metrics(np.full(frames, np.nan), np.full(frames, np.nan), frames / 3)
+    assert m.recall_5 == 0.0
     assert m.completeness == 0.0
     assert m.median_translation_m is None
     assert m.max_rotation_deg is None
     assert m.p95_translation_m is None
-
-
-def test_no_frames():
-    m = localization_metrics(np.array([]), np.array([]), 0.0)
-    assert m.recall_5 == pytest.approx(0.0)
 
 
 # --- worst --------------------------------------------------------------------------------------

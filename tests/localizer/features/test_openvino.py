@@ -31,12 +31,15 @@ def image(seed: int, width: int = 64, height: int = 48) -> np.ndarray:
     [
         (True, FLAGS, True),
         (False, FLAGS, False),
-        (True, FLAGS.replace("amx_bf16", "avx512_bf16"), False),
+        (True, FLAGS.replace("amx_bf16", "avx512_bf16"), True),
+        (True, FLAGS.replace("amx_bf16", "avx512_vnni"), False),
         (True, "CPU architecture: 8\nFeatures: asimd bf16\n", False),
         (True, None, False),
     ],
 )
-def test_it_is_used_where_the_processor_has_tiles(installed, text, wanted, tmp_path, monkeypatch):
+def test_it_is_used_where_the_processor_has_bfloat16(
+    installed, text, wanted, tmp_path, monkeypatch
+):
     spec = ModuleSpec("openvino", None) if installed else None
     monkeypatch.setattr("importlib.util.find_spec", lambda _: spec)
     file = tmp_path / "cpuinfo"

@@ -8,12 +8,9 @@ import pytest
 
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
+from tests.localizer.geometry.test_camera import BROWN, FISHEYE, PRISM, RATIONAL
 
-BROWN = (-0.21, 0.07, 0.0011, -0.0008, -0.012)
-RATIONAL = (2.5, 1.1, 0.0002, -0.0003, 0.05, 2.8, 1.8, 0.25)
 MILD = (0.18, 0.04, 0.0002, -0.0003, 0.002, 0.30, 0.09, 0.01)
-PRISM = (*RATIONAL, 0.004, -0.001, 0.003, 0.002)
-FISHEYE = (-0.012, 0.003, -0.002, 0.0004)
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 PINHOLE = {"width": 640, "height": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
 MATRIX = [500.0, 0, 319.5, 0, 500.0, 239.5, 0, 0, 1]  # OpenCV counts from the first pixel's centre
@@ -127,11 +124,20 @@ def test_another_lens_is_refused_by_name(change, message):
         Camera.from_dict(PINHOLE | change)
 
 
-def test_one_camera_is_read_of_one_file(tmp_path):
-    path = tmp_path / "cameras.txt"
-    path.write_text("<?xml version='1.0'?><calibration><projection>frame</projection>")
-    with pytest.raises(CameraError, match="it is XML; export OpenCV's YAML"):
-        Camera.from_json(path)
-    path.write_text("1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 64 48 50 50 32 24\n")
-    with pytest.raises(CameraError, match="2 cameras; leave one line"):
-        Camera.from_json(path)
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"camera: does not exist"),
+        ("[1, 2]", "width, height"),
+        ('{"width": 640, "height": 480}', "missing fx, fy, cx, cy"),
+        ('{"width": 640, "height": 480, "fx": "x", "fy": 1, "cx": 1, "cy": 1}', "camera"),
+        ("<?xml version='1.0'?><calibration/>", "it is XML; export OpenCV's YAML"),
+        ("1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 64 48 50 50 32 24\n",
+         "2 cameras; leave one line"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_camera_is_named(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "camera").write_text(text)
+    with pytest.raises(CameraError, match=message):
+        Camera.from_json(tmp_path / "camera")

@@ -18,6 +18,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
+from localizer.map.cache.tile import TileMesh
 
 ORIGIN = Geodetic(47.2, 8.2, 430.0)
 SIZE_M = 400.0
@@ -115,6 +116,15 @@ def y_up(enu):
     return np.stack([enu[:, 0], enu[:, 2], -enu[:, 1]], -1)
 
 
+def write_obj(folder: Path, positions, uvs, faces, heads=("mtllib m.mtl", "usemtl a")) -> Path:
+    """m.obj of a textured mesh; uvs: v down. heads: lines before its own."""
+    lines = [*heads, *(f"v {x} {y} {z}" for x, y, z in positions)]
+    lines += [f"vt {u} {1 - v}" for u, v in uvs]
+    lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces]
+    (folder / "m.obj").write_text("\n".join(lines))
+    return folder / "m.obj"
+
+
 def write_tileset(folder: Path, *, levels: int = 3, refine: str = "REPLACE") -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     seeds = iter(range(1000))
@@ -181,6 +191,23 @@ def write_raster(path: Path, data, crs="EPSG:32632", step=1.0, place=PLACE, **op
     return path
 
 
+def cut_out(source: Path, out: Path, share: float = 0.25) -> Path:
+    """The middle of a raster, `share` of its sides, as a raster of its own."""
+    with rasterio.open(source) as whole:
+        left, bottom, right, top = whole.bounds
+        middle, reach = (left + right) / 2, share * (right - left) / 2
+        centre, height = (bottom + top) / 2, share * (top - bottom) / 2
+        part = (middle - reach, centre - height, middle + reach, centre + height)
+        window = whole.window(*part).round_offsets().round_lengths()
+        profile = whole.profile | {
+            "driver": "GTiff", "width": window.width, "height": window.height,
+            "transform": whole.window_transform(window),
+        }  # fmt: skip
+        with rasterio.open(out, "w", **profile) as file:
+            file.write(whole.read(window=window))
+    return out
+
+
 @pytest.fixture(scope="session")
 def make() -> SimpleNamespace:
     """The builders of this file."""
@@ -220,6 +247,12 @@ def built(source: Path, out: Path, **options) -> TileCache:
     """A cache that was built in this process."""
     build_cache(source, out, BuildOptions(workers=1, **options))
     return TileCache.open(out)
+
+
+def leaf_meshes(cache: TileCache) -> list[TileMesh]:
+    """The finest tiles of a cache."""
+    index = cache.index
+    return [cache.load_tile(tile) for node in index.leaves for tile in index.tiles_of(node)]
 
 
 @pytest.fixture

@@ -14,11 +14,15 @@ from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.relocalization.align import FrameShift, displacement
 from localizer.relocalization.config import RelocalizationConfig
-from localizer.relocalization.correlate import ORIGIN_CELLS, LevelCorrelator, transform_patch
+from localizer.relocalization.correlate import (
+    ORIGIN_CELLS,
+    ROUGH_CELLS,
+    LevelCorrelator,
+    transform_patch,
+)
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import footprint, rectify, with_heading
 from localizer.relocalization.search import (
-    BlockScores,
     Rectification,
     SearchView,
     above_roofs,
@@ -27,6 +31,7 @@ from localizer.relocalization.search import (
     peaks,
     search,
     trial_heights,
+    trial_noise,
 )
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
@@ -93,7 +98,7 @@ def test_scores_are_normalised_correlations():
     checked = 0
     for block in correlator.blocks(n):
         scores = correlator.correlate(spectra, block)
-        for i, j in ((1, 2), (25, 45), (38, 60), (block.side - 1, 20)):
+        for i, j in ((1, 2), (25, 45), (38, 60), (len(scores) - 1, 20)):
             r, c = block.row + i * ORIGIN_CELLS, block.column + j * ORIGIN_CELLS
             if min(r, c) < 0 or max(r, c) + n > 288:
                 continue
@@ -192,46 +197,46 @@ def test_a_trials_noise_is_that_of_the_ground_it_was_compared_with(monkeypatch):
     def noise(overview):
         found = []
         monkeypatch.setattr(
-            "localizer.relocalization.search.BlockScores",
-            lambda *parts: found.append(parts[1]) or BlockScores(*parts),
+            "localizer.relocalization.search.trial_noise",
+            lambda *parts: found.append(trial_noise(*parts)) or found[-1],
         )
         asked = query(heading_sigma_rad=0.01, height_m=40.0)
         view = SearchView(np.full((120, 160, 3), 99, np.uint8), CAMERA)
         assert search(view, asked, (LevelCorrelator(overview, 0),), SameFeatures(), CONFIG)
-        return found[0]
+        return found[0][0]
 
     assert noise(strip) == pytest.approx(noise(whole), rel=0.15)
 
 
-def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
-    """The least recently used would be the next one wanted: going round, nothing was ever found."""
-    features = smooth(0, 512)
-    one = LevelCorrelator(level(features), 1 << 40)
-    patch = transform_patch(np.ones((16, 16, 3), np.float32), np.ones((16, 16), np.float32))
-    blocks = one.blocks(96)
-    size = 3 * 128 * 65 * 8 + 32 * 17 * 8
-    made = []
-    correlator = LevelCorrelator(level(features), 5 * size)
-    transform = scipy.fft.rfft2
+def test_rough_scores_are_of_every_second_compared_origin():
+    """Features twice as smooth hold nothing that the rough pass leaves out."""
+    features = np.stack([cv2.GaussianBlur(x.astype(np.float32), (0, 0), 4) for x in smooth(1, 320)])
+    correlator = LevelCorrelator(level(np.rint(features * 5).astype(np.int8)), 1 << 26)
+    cut = features[:, 100:140, 120:160].transpose(1, 2, 0)
+    spectra = transform_patch(cut, np.ones((40, 40), np.float32))
+    for block in correlator.blocks(40):
+        fine, rough = (correlator.correlate(spectra, block, n) for n in (ORIGIN_CELLS, ROUGH_CELLS))
+        np.testing.assert_allclose(rough, fine[::2, ::2], atol=0.05)
+
+
+def test_a_large_maps_spectra_are_computed_once_a_pass_and_the_place_is_found(monkeypatch):
+    """Of all headings, with room for few blocks. Each heading computed all of them anew."""
+    overview = level(smooth(8, 1024))
+    overview.features[:, 640 : 640 + 32, 333 : 333 + 32] = smooth(9, 32)
+    asked = query(height_m=32 * overview.cell_m / footprint(CAMERA, DOWN, 1.0, 9.0).side_m)
+    correlator = LevelCorrelator(overview, 5 * 3 * 128 * 65 * 8)
+    made, transform = [], scipy.fft.rfft
     monkeypatch.setattr(
-        scipy.fft, "rfft2", lambda x, *a, **k: (made.append(x.ndim), transform(x, *a, **k))[1]
+        scipy.fft, "rfft", lambda x, *a, **k: (made.append(x.shape), transform(x, *a, **k))[1]
     )
-
-    def transformed(wanted):
-        made.clear()
-        correlator.begin()
-        for block in wanted * 2:
-            np.testing.assert_allclose(
-                correlator.correlate(patch, block), one.correlate(patch, block), atol=1e-6
-            )
-        return made.count(3)
-
-    for block in blocks:
-        one.correlate(patch, block)
-    n = len(blocks)
-    assert n > 10
-    assert transformed(blocks) == n + (n - 5)  # the second round finds five
-    assert transformed(blocks[-5:]) == 5  # and another search its own
+    view = SearchView(np.full((120, 160, 3), 99, np.uint8), CAMERA)
+    found = search(view, asked, (correlator,), SameFeatures(), CONFIG)
+    assert found is not None
+    at = found[0].world_from_camera.translation[:2] / overview.cell_m
+    np.testing.assert_allclose(at, (333 + 16, -640 - 16), atol=0.5)
+    blocks = len(correlator.blocks(32))
+    assert blocks >= 25
+    assert blocks <= made.count((3, 256, 256)) <= 2 * blocks
 
 
 def test_rectified_ground_lies_where_it_is():

@@ -31,13 +31,9 @@ def _ramp():
     return np.stack([40 + 2 * x, 30 + 3 * y, 200 - x - y], -1).round().astype(np.uint8)
 
 
-def test_a_whole_view_is_left_alone():
-    view = _view(_ramp(), np.ones((48, 64), bool))
-    assert fill_holes(view) is view.rgb
-
-
-def test_a_view_of_nothing_is_left_alone():
-    view = _view(_ramp(), np.zeros((48, 64), bool))
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_whole_view_and_one_of_nothing_are_left_alone(shown):
+    view = _view(_ramp(), np.full((48, 64), shown))
     assert fill_holes(view) is view.rgb
 
 

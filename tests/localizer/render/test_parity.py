@@ -41,7 +41,8 @@ def photo(seed: int, size: int = 512) -> np.ndarray:
 
 
 def scene() -> list[TileMesh]:
-    """Four tiles of hills with boxes, far from the world's origin."""
+    """Four turned tiles of hills with boxes, far from the world's origin."""
+    turned = so3_exp([0.02, -0.01, 0.7])
     rng = np.random.default_rng(7)
     meshes = []
     for i, (west, south) in enumerate([(-100, -100), (0, -100), (-100, 0), (0, 0)]):
@@ -56,11 +57,11 @@ def scene() -> list[TileMesh]:
         faces = [np.stack([j, j + 41, j + 1], 1), np.stack([j + 1, j + 41, j + 42], 1)]
         meshes.append(
             TileMesh(
-                np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32),
+                (np.stack([x, y, z], -1).reshape(-1, 3) @ turned).astype(np.float32),
                 uv.astype(np.float32),
                 np.concatenate(faces).astype(np.int32),
                 build_mips(photo(i)),
-                Pose(np.eye(3), np.array([5000.0 + west, -2000.0 + south, 50.0])),
+                Pose(turned, np.array([5000.0 + west, -2000.0 + south, 50.0])),
             )
         )
     return meshes

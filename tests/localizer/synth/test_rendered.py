@@ -102,8 +102,3 @@ def test_every_condition_is_deterministic_and_visible(condition, view):
     assert image.dtype == np.uint8
     np.testing.assert_array_equal(image, draw())
     assert np.abs(image.astype(int) - rgb).mean() > 3
-
-
-def test_an_unknown_condition_is_refused() -> None:
-    with pytest.raises(ValueError, match="sandstorm"):
-        sample_appearance(np.random.default_rng(0), "sandstorm")

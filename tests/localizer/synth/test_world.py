@@ -2,18 +2,16 @@
 
 import hashlib
 import json
-import struct
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from localizer.errors import MapSourceError
 from localizer.geometry.camera import Camera
@@ -26,8 +24,7 @@ from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, c
 from localizer.synth.plan.layout import plan_world
 from localizer.synth.plan.plan import WorldPlan
 from localizer.synth.visits.changes import Changes, apply_changes
-from localizer.synth.visits.survey import SurveyErrors
-from localizer.synth.visits.visit import survey_and_flight_visits
+from localizer.synth.visits.visit import SurveyErrors, survey_and_flight_visits
 from localizer.synth.world import WorldInfo, build_world
 
 TERRAIN_FACES = 2 * 20 * 20  # of a leaf, first in its face list
@@ -36,14 +33,8 @@ TERRAIN_FACES = 2 * 20 * 20  # of a leaf, first in its face list
 @dataclass
 class Content:
     positions: np.ndarray  # (V, 3) in the tile's z-up frame
-    uvs: np.ndarray
     faces: np.ndarray
-    jpeg: bytes
-
-    @property
-    def image(self) -> np.ndarray:
-        image: Any = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
-        return image[..., ::-1]
+    image: np.ndarray
 
 
 @dataclass
@@ -73,7 +64,7 @@ def _walk(folder: Path, tile: dict, above: np.ndarray, parent: Tile | None) -> I
         above @ own,
         np.array(tile["boundingVolume"]["box"]),
         tile["geometricError"],
-        read_glb((folder / uri).read_bytes()),
+        read_glb(folder / uri),
         tile,
         parent,
     )
@@ -82,43 +73,11 @@ def _walk(folder: Path, tile: dict, above: np.ndarray, parent: Tile | None) -> I
         yield from _walk(folder, child, this.ecef_from_tile, this)
 
 
-def read_glb(data: bytes) -> Content:
-    magic, version, total = struct.unpack_from("<4sII", data)
-    assert (magic, version, total) == (b"glTF", 2, len(data))
-    length, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON"
-    assert length % 4 == 0
-    document = json.loads(data[20 : 20 + length])
-    size, kind = struct.unpack_from("<I4s", data, 20 + length)
-    assert kind == b"BIN\0"
-    binary = data[28 + length : 28 + length + size]
-    assert document["buffers"][0]["byteLength"] == size
-
-    def accessor(index: int) -> np.ndarray:
-        a = document["accessors"][index]
-        view = document["bufferViews"][a["bufferView"]]
-        width = {"VEC3": 3, "VEC2": 2, "SCALAR": 1}[a["type"]]
-        dtype = {5126: "<f4", 5125: "<u4"}[a["componentType"]]
-        assert view["byteOffset"] % 4 == 0
-        assert view["byteLength"] == a["count"] * width * 4
-        values = np.frombuffer(binary, dtype, a["count"] * width, view["byteOffset"])
-        values = values.reshape(-1, width)
-        if "min" in a:
-            np.testing.assert_allclose(values.min(0), a["min"], rtol=1e-6)
-            np.testing.assert_allclose(values.max(0), a["max"], rtol=1e-6)
-        return values
-
-    primitive = document["meshes"][0]["primitives"][0]
-    x, y, z = accessor(primitive["attributes"]["POSITION"]).astype(float).T
-    image = document["images"][0]
-    assert image["mimeType"] == "image/jpeg"
-    view = document["bufferViews"][image["bufferView"]]
-    return Content(
-        np.stack([x, -z, y], -1),  # glTF is y-up
-        accessor(primitive["attributes"]["TEXCOORD_0"]),
-        accessor(primitive["indices"]).reshape(-1, 3).astype(np.int64),
-        binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]],
-    )
+def read_glb(path: Path) -> Content:
+    (mesh,) = trimesh.load_scene(path, process=False).geometry.values()
+    x, y, z = np.asarray(mesh.vertices, float).T
+    image = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
+    return Content(np.stack([x, -z, y], -1), np.asarray(mesh.faces), image)  # glTF is y-up
 
 
 def box_half(tile) -> tuple[np.ndarray, np.ndarray]:

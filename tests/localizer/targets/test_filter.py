@@ -160,24 +160,6 @@ def _car(time_s, turned_s=21.0):
     return np.array([40.0, SPEED * out - 120.0, 0.0])
 
 
-def test_a_car_that_turned_about_unseen_was_told_hundreds_of_metres_off():
-    """The cause of a car 414 m off: frames were missing for as long, and one sighting does not
-    fit: the answer was the old track, carried on. Now it is refused, and nothing is extrapolated.
-    """
-    old = TargetFilter()
-    for k in range(21):
-        seen = _car(20.0 + k * 0.05, turned_s=99.0)
-        surface = TargetSurface(1.0, seen, np.eye(3) * 0.09)
-        old.update(TargetSighting("car", (surface,), (0.0, 0.0), round((20 + k * 0.05) * 1e9)))
-    expected = old.expected(round(41.7e9))
-    assert expected is not None
-    carried, _ = expected
-    back = _car(41.7, turned_s=21.0)
-    assert np.linalg.norm(carried - back) > 400.0  # what used to be reported
-    surface = TargetSurface(1.0, back, np.eye(3) * 0.09)
-    assert old.update(TargetSighting("car", (surface,), (0.0, 0.0), round(41.7e9))) is None
-
-
 def test_a_moving_target_begins_anew_after_a_gap_and_lies_under_its_pixel():
     track = TargetTrack("car", TargetSettings(), cast)
 

@@ -1,21 +1,19 @@
-"""The paper's network: shapes of Table 5, one function before and after fusing, export, float16."""
+"""The paper's network: shapes of Table 5, one function before and after fusing."""
 
 from __future__ import annotations
 
 import copy
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `train`")
-from localizer.training.export.export import OPSET, Deployed  # noqa: E402
+from localizer.training.models.networks import fuse  # noqa: E402
 from localizer.training.models.s0 import (  # noqa: E402
     STRIDES,
     BranchedBlock,
     S0Config,
     S0Net,
-    fuse,
 )
 
 
@@ -61,23 +59,3 @@ def test_fused_is_the_same_function(trained, fused):
         for before, after in zip(trained(image), fused(image), strict=True):
             for a, b in zip(before, after, strict=True):
                 np.testing.assert_allclose(a, b, atol=1e-5)
-
-
-def test_exported_graph_takes_any_size(fused, tmp_path):
-    names = [f"{kind}_{k}" for k in range(3) for kind in ("features", "confidence")]
-    axes = {"image": {1: "height", 2: "width"}}
-    axes |= {name: {1: f"h{name[-1]}", 2: f"w{name[-1]}"} for name in names}
-    deployed, path = Deployed(fused).eval(), tmp_path / "s0.onnx"
-    torch.onnx.export(
-        deployed, (torch.zeros(1, 64, 96, 3, dtype=torch.uint8),), str(path),
-        input_names=["image"], output_names=names, dynamic_axes=axes, opset_version=OPSET,
-        dynamo=False,
-    )  # fmt: skip
-    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    rng = np.random.default_rng(0)
-    for size in ((64, 96), (40, 56)):
-        image = rng.integers(0, 256, (1, *size, 3), dtype=np.uint8)
-        with torch.no_grad():
-            expected = deployed(torch.from_numpy(image))
-        for found, value in zip(session.run(names, {"image": image}), expected, strict=True):
-            np.testing.assert_allclose(found, value.numpy(), atol=2e-4)

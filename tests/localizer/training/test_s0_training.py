@@ -59,15 +59,6 @@ def model(trainer: Trainer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_yaml_names_the_network(tmp_path: Path) -> None:
-    text = (CONFIGS / "train_s0_cpu.yaml").read_text()
-    path = tmp_path / "run.yaml"
-    for wrong, why in (("network: s1", "s1"), ("network: s0\n  widths: [1, 2, 3]", "widths")):
-        path.write_text(text.replace("network: s0", wrong, 1))
-        with pytest.raises(ModelError, match=why):
-            load_config(path)
-
-
 def test_confidence_is_learned_once_eq_3_has_come_in(config: TrainConfig, tmp_path: Path) -> None:
     run = Trainer(config.model_copy(update={"output": tmp_path}))
     heads = [head.weight.detach().clone() for head in run.model.uncertainties]

@@ -19,13 +19,9 @@ from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.quaternion import from_euler
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, PX4, FirmwareProfile
+from tests.mavlink_bridge.simulated import GEOID, HOME, METRE, MS, SECOND
 
-MS = 1_000_000
-SECOND = 1_000 * MS
-HOME = (47.397742, 8.545594)
-GEOID = 47.0
 ORIGIN = Origin(*HOME, 488.0)
-METRE = 1.0 / 111318.84502145034
 
 
 def context(
@@ -103,13 +99,6 @@ def test_fix_is_sent_at_the_configured_delay_with_its_exposure_time() -> None:
     assert lags == {100}
     assert all(i.estimate.fresh for _, i in sent)
     assert sent[0][1].message.usec == sent[0][1].estimate.position.time_ns // 1000
-
-
-def test_position_is_ned_from_the_origin_and_altitude_is_amsl() -> None:
-    it = injector(rate_hz=10, delay_ms=0)
-    it.submit(fix(SECOND, north=120.0, east=-35.0), SECOND)
-    message = it.step(SECOND, context()).message  # type: ignore[union-attr]
-    assert (message.x, message.y, message.z) == pytest.approx((120.0, -35.0, -60.0), abs=0.01)
 
 
 def test_slow_fixes_are_propagated_to_a_steady_rate_and_least_lag_stays_the_delay() -> None:
@@ -202,32 +191,22 @@ def test_sending_ends_when_the_next_fix_is_overdue(fix_hz: float, silent_after_s
 
 
 def firmware_error_m(covariance: Any, profile: FirmwareProfile) -> float:
-    """What a firmware makes of the message's covariance."""
+    """What ArduPilot makes of the message's covariance."""
     if profile is ARDUPILOT:  # GCS_Common.cpp: cbrtf(sq(c0) + sq(c6) + sq(c11))
         return float(sum(covariance[i] ** 2 for i in DIAGONAL[:3]) ** (1 / 3))
-    if profile is ARDUPILOT_SQRT:  # pull request 32084
-        return math.sqrt(sum(covariance[i] for i in DIAGONAL[:3]))
-    return math.sqrt(covariance[0])
-
-
-@pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT, PX4])
-@pytest.mark.parametrize("sigma", [0.5, 2.0])
-def test_firmware_reads_the_error_that_was_meant(profile: FirmwareProfile, sigma: float) -> None:
-    it = injector(rate_hz=10, delay_ms=0, sigma_floor_m=1e-6)
-    it.submit(fix(SECOND, position_covariance_ned=np.eye(3) * sigma**2), SECOND)
-    covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
-    assert firmware_error_m(covariance, profile) == pytest.approx(sigma, rel=1e-4)
+    return math.sqrt(sum(covariance[i] for i in DIAGONAL[:3]))  # pull request 32084
 
 
 @pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT])
-def test_ardupilot_reads_the_worst_axis(profile: FirmwareProfile) -> None:
+@pytest.mark.parametrize("sigma", [0.6, 2.0])
+def test_ardupilot_reads_the_worst_axis(profile: FirmwareProfile, sigma: float) -> None:
     """A street seen along: 2 m along it, half a metre across. One number has to do."""
     turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
     it = injector(rate_hz=10, delay_ms=0, sigma_floor_m=1e-6)
-    P = turn @ np.diag([4.0, 0.25, 0.01]) @ turn.T
+    P = turn @ np.diag([sigma**2, 0.25, 0.01]) @ turn.T
     it.submit(fix(SECOND, position_covariance_ned=P), SECOND)
     covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
-    assert firmware_error_m(covariance, profile) == pytest.approx(2.0, rel=1e-4)
+    assert firmware_error_m(covariance, profile) == pytest.approx(sigma, rel=1e-4)
 
 
 def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
@@ -303,30 +282,19 @@ def test_gross_difference_is_refused_however_slowly_it_came() -> None:
     assert 20 * SECOND < max(i.estimate.position.time_ns for _, i in sent) <= 22 * SECOND
 
 
-def test_gyros_are_trusted_over_a_dropout() -> None:
-    it = injector(rate_hz=10, delay_ms=0)
-    where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
-
-    def dropout(f: VisionFix) -> VisionFix | None:
-        return None if 9 * SECOND <= f.time_ns < 15 * SECOND else f
-
-    sent = fly(it, seconds=17, fix_hz=10, latency_ms=0, where=where, change=dropout)
-    assert [t for t, _ in sent if t > 15.5 * SECOND]
-
-
-def test_after_a_long_dropout_the_gyros_are_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("memory_s", "taken"), [(60.0, True), (2.0, False)])
+def test_gyros_are_trusted_over_a_dropout_and_not_over_a_long_one(monkeypatch, memory_s, taken):
     """They drift: what they say of a minute ago is no evidence against the autopilot's yaw."""
-    monkeypatch.setattr("mavlink_bridge.injection.yaw_guard._MEMORY_S", 2.0)
+    monkeypatch.setattr("mavlink_bridge.injection.yaw_guard._MEMORY_S", memory_s)
     it = injector(rate_hz=10, delay_ms=0)
     where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
 
     def dropout(f: VisionFix) -> VisionFix | None:
         return None if 4 * SECOND <= f.time_ns < 10 * SECOND else f
 
-    sent = fly(it, seconds=14, fix_hz=10, latency_ms=0, where=where, change=dropout)
-    assert [t for t, _ in sent if t < 4 * SECOND]
-    assert not [t for t, i in sent if t > 10 * SECOND and i.estimate.fresh]
-    assert it.guard.blocked
+    sent = fly(it, seconds=11, fix_hz=10, latency_ms=0, where=where, change=dropout)
+    assert any(t > 10 * SECOND and i.estimate.fresh for t, i in sent) is taken
+    assert it.guard.blocked is not taken
 
 
 def test_what_was_refused_is_released_by_a_tighter_limit_than_it_was_held_to() -> None:
@@ -353,10 +321,14 @@ def test_single_wild_yaw_is_dropped_without_blocking() -> None:
     assert it.counters["fixes_yaw_refused"] == 1
 
 
-def test_without_an_origin_nothing_local_is_sent_and_the_reason_says_so() -> None:
+@pytest.mark.parametrize(
+    ("origin", "reason"),
+    [(None, AlertId.EKF_NO_ORIGIN), (Origin(HOME[0], -60.0, 480.0), AlertId.EKF_ORIGIN_FAR)],
+)
+def test_without_a_near_origin_nothing_local_is_sent_and_the_reason_says_so(origin, reason):
     it = injector(rate_hz=10, delay_ms=0)
-    assert fly(it, seconds=1, fix_hz=10, latency_ms=0, where=context(origin=None)) == []
-    assert it.reason == alert(AlertId.EKF_NO_ORIGIN)
+    assert fly(it, seconds=1, fix_hz=10, latency_ms=0, where=context(origin=origin)) == []
+    assert it.reason.id is reason
 
 
 def test_late_future_and_unordered_fixes_are_dropped_and_counted() -> None:
@@ -377,11 +349,10 @@ def test_unknown_attitude_is_sent_as_nan() -> None:
     it.submit(unknown, SECOND)
     message = it.step(SECOND, context()).message  # type: ignore[union-attr]
     assert math.isnan(message.yaw)
-    assert it.guard.unchecked == 1
 
 
 @pytest.mark.parametrize("latency_ms", [0, 400])
-def test_each_velocity_is_sent_once(latency_ms: float) -> None:
+def test_each_velocity_is_sent_once_in_the_frames_that_ardupilot_accepts(latency_ms: float) -> None:
     """Also of fixes that are too old to be sent as they are."""
     it = injector(message="odometry", rate_hz=20, delay_ms=0)
 
@@ -393,33 +364,16 @@ def test_each_velocity_is_sent_once(latency_ms: float) -> None:
     assert known.count(True) == pytest.approx(40 - latency_ms // 100, abs=2)
     assert known.count(False) >= 25
     assert not any(i.message.vx == 0.0 for t, i in sent if t > 2 * SECOND)
+    assert {(i.message.frame_id, i.message.child_frame_id) for _, i in sent} == {(20, 12)}
 
 
 def test_a_velocity_that_is_derived_from_positions_is_not_sent() -> None:
     """On PX4's interface the EKF passed a jump of 20 m by 1 m; on ArduPilot it ended in LAND."""
     it = injector(message="odometry", delay_ms=0)
-    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, speed=5.0)
-    assert len(sent) > 30
+    sent = fly(it, seconds=1, fix_hz=10, latency_ms=0, speed=5.0)
+    assert len(sent) > 8
     assert all(math.isnan(v) for _, i in sent for v in (i.message.vx, i.message.vy, i.message.vz))
     assert all(math.isnan(i.message.velocity_covariance[0]) for _, i in sent)
-
-
-def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
-    it = injector(message="odometry", rate_hz=10, delay_ms=0)
-    east = math.radians(90.0)
-
-    def turned(f: VisionFix) -> VisionFix:
-        north, velocity = 10.0 * f.time_ns / SECOND, (10.0, 0.0, 0.0)
-        return fix(f.time_ns, north, yaw_rad=east, quality=77, velocity_ned=velocity)
-
-    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, where=context(yaw=east), change=turned)
-    m = sent[-1][1].message
-    assert (m.frame_id, m.child_frame_id) == (20, 12)
-    # Nose to the east, flying north: the body moves to its left.
-    assert (m.vx, m.vy, m.vz) == pytest.approx((0.0, -10.0, 0.0), abs=0.3)
-    assert m.quality == 77
-    assert 0.0 < m.velocity_covariance[0] < 1.0
-    assert m.q == pytest.approx([math.cos(east / 2), 0.0, 0.0, math.sin(east / 2)], abs=1e-6)
 
 
 def test_gps_input_fills_every_field() -> None:

@@ -11,10 +11,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import ChosenSet, GnssProblem, Output
-from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
+from mavlink_bridge.config import (
+    BridgeConfig,
+    InjectionConfig,
+    InjectionEnableConfig,
+    SourceSwitchConfig,
+)
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.interlock import ShadowInterlock
-from mavlink_bridge.injection.restart_memory import ShadowFailureMemory
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.status_notifier import StatusNotifier
@@ -67,18 +71,29 @@ def test_a_map_20_m_off_is_neither_injected_nor_switched_to(monkeypatch):
 
 def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(monkeypatch, tmp_path):
     """The process that had seen it was killed, the next one had nothing to compare with: after two
-    seconds it injected.
+    seconds it injected. Another map is not blamed.
     """
     enable, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
-    killed = on_gnss(monkeypatch, state_file=enable)
+
+    def begun(map_id: str) -> Flight:
+        flight = on_gnss(monkeypatch, state_file=enable)
+        flight.end.interlock.set_map_id(map_id)
+        flight.end.interlock.recall()
+        return flight
+
+    killed = begun("map a")
     killed.north_m = 20.0
     killed.run(15.0)
     assert killed.vision() == []
     while not file.exists():  # written by its own thread
         pass
-    again = on_gnss(monkeypatch, state_file=enable)
+    other = begun("map b")
+    other.gnss_north_m = None
+    other.run(10.0)
+    assert other.vision()
+    other.end.interlock.end(clean_shutdown=False)
+    again = begun("map a")
     again.north_m, again.gnss_north_m = 20.0, None
-    again.end.recall()
     again.run(30.0)
     assert again.vision() == []
     assert set(told(again, AlertId.SHADOW_RESTORED, OFF.id)) == {AlertId.SHADOW_RESTORED}
@@ -89,82 +104,21 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(monkeypatch, tm
     while file.exists():
         pass
     for flight in (killed, again):
-        flight.end.end()
+        flight.end.interlock.end()
     assert not file.exists()
 
 
-def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(monkeypatch, tmp_path):
-    enable, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
-    killed = on_gnss(monkeypatch, state_file=enable)
-    killed.end.set_map_id("map a")
-    killed.north_m = 20.0
-    killed.run(15.0)
-    while not file.exists():
-        pass
-    again = on_gnss(monkeypatch, state_file=enable)
-    again.end.set_map_id("map b")
-    again.gnss_north_m = None
-    again.end.recall()
-    again.run(10.0)
-    assert again.vision()
-    assert told(again, AlertId.SHADOW_RESTORED, OFF.id) == []
-    for flight in (killed, again):
-        flight.end.end()
-
-
-@pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, [True])])
-def test_only_who_never_began_is_kept_from_beginning_by_a_restart(begins, kept):
+def test_who_has_begun_is_not_kept_from_beginning_by_a_restart(monkeypatch, tmp_path):
     """A receiver that is led astray while vision is flown on speaks against it, too: without the
     restart it is flown on.
     """
-    told: list[bool] = []
-
-    class Memory(ShadowFailureMemory):
-        def __init__(self) -> None:
-            """Has no file."""
-
-        def recall_state(self) -> None:
-            return None
-
-        def store_state(self, state: dict[str, Any]) -> None:
-            told.append(state["against"])
-
-        def drop(self) -> None:
-            told.append(False)
-
-    scores = [ShadowScore(begins, 100, () if begins else (RATE,))]
-    interlock = ShadowInterlock(
-        False,
-        lambda _: scores[-1],
-        lambda: SECOND,
-        StatusNotifier(lambda _: None),
-        Memory(),
-    )
-    interlock.recall()
-    for second, against in ((1, ()), (2, (OFF,)), (4, (OFF,))):
-        if against:
-            scores.append(ShadowScore(False, 100, against, against=against))
-        state = VehicleState(connected=True, gps_fix_type=3, gps_time_ns=second * SECOND)
-        mode = interlock.mode("inject", state, second * SECOND, by_pilot=False)
-        assert mode == ("inject" if begins else "shadow")
-    assert told == kept
-
-
-def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(monkeypatch):
-    flight = on_gnss(monkeypatch, switch=SWITCH)
-    begun_ns = flight.now_ns
-    flight.run(20.0)
-    assert 5 * SECOND < flight.vision()[0][0] - begun_ns < 10 * SECOND
-    assert orders(flight) == []
-    flight.gnss_north_m = None
-    flight.run(6.0)
-    assert orders(flight)
-    assert set(orders(flight)) == {2.0}
-    news = (AlertId.INJECTING, AlertId.GNSS_LOST, AlertId.SOURCE_SET_SELECTED, *SHADOW)
-    assert told(flight, *news) == list(news[:3])
-    flight.gnss_north_m = 0.0
-    flight.run(8.0)
-    assert told(flight, AlertId.GNSS_BACK) == [AlertId.GNSS_BACK]
+    flight = on_gnss(monkeypatch, state_file=tmp_path / "gate.json")
+    flight.run(12.0)
+    flight.gnss_north_m = flight.ekf_north_m = 20.0
+    flight.run(30.0)
+    assert flight.end.shadow_score(flight.now_ns).against
+    flight.end.interlock.end(clean_shutdown=False)  # what is stored is on the disk then
+    assert not (tmp_path / "shadow-no-go.json").exists()
 
 
 def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(monkeypatch):
@@ -376,18 +330,6 @@ def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(monkeypatch
     assert flight.vision(begun_ns)  # taking it back would leave the vehicle without a position
 
 
-def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    enable = InjectionEnable(InjectionEnableConfig(), lambda _: None)
-    flight = on_gnss(monkeypatch, enable=enable, mode="rc")
-    flight.north_m = 20.0
-    flight.run(15.0)
-    assert flight.vision() == []
-    assert enable.command(31010, 1.0) == 0
-    flight.run(5.0)
-    assert flight.vision()
-    assert told(flight, *SHADOW) == [AlertId.INJECTION_NOT_READY]
-
-
 def test_what_gps_input_told_the_receiver_is_no_word_for_vision(monkeypatch):
     """The pilot had injected a map 20 m off: receiver and EKF repeated it, which was a go, and his
     next injection and a switch to vision began without a word.
@@ -440,7 +382,7 @@ class Compared:
     def __init__(self) -> None:
         self._go, self._compared_ns = False, 0
         self._interlock = ShadowInterlock(
-            False,
+            BridgeConfig(),
             lambda _: ShadowScore(self._go, 100, () if self._go else (RATE,)),
             lambda: self._compared_ns,
             StatusNotifier(lambda _: None),
@@ -494,19 +436,27 @@ def test_a_vehicle_met_in_flight_is_judged_with_its_first_gnss_report(monkeypatc
 def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each event once, in its order, and nothing else."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
+    begun_ns = flight.now_ns
     flight.run(2.0)
     flight.armed = True
     flight.run(28.0)  # shadow, go, injecting
+    assert 5 * SECOND < flight.vision()[0][0] - begun_ns < 10 * SECOND
     flight.gnss_north_m = None
     flight.run(1.0)
     flight.gnss_north_m = 0.0  # a second without a report is none
     flight.run(10.0)
+    assert orders(flight) == []
     flight.gnss_north_m = None
     flight.run(20.0)
-    flight.sees = False
-    flight.run(5.0)
-    flight.sees = True
-    flight.run(20.0)
+    assert set(orders(flight)) == {2.0}
+    for gap_s in (0.8, 5.0):  # a few fixes that are dropped are no news
+        flight.sees = False
+        flight.run(gap_s)
+        flight.sees = True
+        flight.run(2.0)
+    flight.run(18.0)
+    flight.gnss_north_m = 0.0
+    flight.run(8.0)
     assert [a.id for a in flight.alerts] == [
         AlertId.FC_FOUND,
         AlertId.ORIGIN_KNOWN,
@@ -516,6 +466,7 @@ def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
         AlertId.SOURCE_SET_SELECTED,
         AlertId.NO_FRESH_FIX,
         AlertId.INJECTING,
+        AlertId.GNSS_BACK,
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,15 +23,13 @@ from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.injection.fix_warnings import FixWarnings
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.injection.propagate import PropagatedFix
-from mavlink_bridge.injection.shadow import ShadowScorer
+from mavlink_bridge.injection.shadow import ShadowScore, ShadowScorer
 from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.profile import ARDUPILOT, GENERIC, FirmwareProfile
+from tests.mavlink_bridge.simulated import HOME, METRE, MS, SECOND
 
-MS = 1_000_000
-SECOND = 1_000 * MS
-HOME = (47.397742, 8.545594)
-METRE = 1.0 / 111318.84502145034
 GOOD_FLAGS = 831
 
 
@@ -68,22 +67,32 @@ def vehicle(now_ns: int = SECOND, **options: Any) -> VehicleState:
 # --- shadow -------------------------------------------------------------------------------------
 
 
-def scored(error_m: float, *, sigma: float = 0.5, hz: float = 10.0, seconds: float = 10.0) -> Any:
+def scored(
+    error_m: float = 0.1,
+    *,
+    sigma: float = 0.5,
+    hz: float = 10.0,
+    seconds: float = 10.0,
+    altitude: float = 500.0,
+    yaw_deg: float | None = None,
+) -> ShadowScore:
+    """Fixes at 600 m above the ellipsoid with 100 m of geoid, and what the autopilot has."""
     rng = np.random.default_rng(1)
     scorer = ShadowScorer(100.0)
     for i in range(int(hz * seconds)):
         north = error_m + rng.normal(0.0, 0.2)
-        scorer.compare(position(int(i * SECOND / hz), north, sigma), (*HOME, 500.0))
-    return scorer.score(int(seconds * SECOND), None)
+        scorer.compare(position(int(i * SECOND / hz), north, sigma), (*HOME, altitude))
+    return scorer.score(int(seconds * SECOND), None if yaw_deg is None else math.radians(yaw_deg))
 
 
 def test_good_vision_is_a_go() -> None:
-    score = scored(0.5)
+    score = scored(0.5, altitude=493.0)
     assert score.ready
     assert score.samples == 100
     assert score.median_m == pytest.approx(0.5, abs=0.1)
     assert score.bias_ne_m == pytest.approx((0.5, 0.0), abs=0.1)
     assert score.rate_hz == pytest.approx(10.0)
+    assert score.height_m == pytest.approx(7.0)
     assert score.line().startswith("ready: median 0.5 m")
 
 
@@ -92,8 +101,13 @@ def test_good_vision_is_a_go() -> None:
     [
         ({"error_m": 4.0, "sigma": 4.0}, AlertId.SHADOW_MEDIAN),
         ({"error_m": 2.9 * 2, "sigma": 0.1}, AlertId.SHADOW_COVARIANCE),
-        ({"error_m": 0.1, "seconds": 3.0}, AlertId.SHADOW_FEW_FIXES),
-        ({"error_m": 0.1, "hz": 2.0, "seconds": 40.0}, AlertId.SHADOW_RATE),
+        ({"seconds": 3.0}, AlertId.SHADOW_FEW_FIXES),
+        ({"hz": 2.0, "seconds": 40.0}, AlertId.SHADOW_RATE),
+        ({"seconds": 0.0}, AlertId.SHADOW_NOT_COMPARED),
+        ({"yaw_deg": 5.0}, AlertId.SHADOW_YAW),
+        # A geoid that is missing, or of the wrong sign.
+        ({"altitude": 547.0}, AlertId.SHADOW_HEIGHT),
+        ({"altitude": 406.0}, AlertId.SHADOW_HEIGHT),
     ],
 )
 def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason: AlertId) -> None:
@@ -101,37 +115,7 @@ def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason
     assert not score.ready
     assert reason in {r.id for r in score.reasons}
     assert score.line().startswith("not ready: ")
-
-
-@pytest.mark.parametrize(("altitude", "go"), [(493.0, True), (547.0, False), (406.0, False)])
-def test_a_wrong_geoid_is_seen_in_the_heights(altitude: float, go: bool) -> None:
-    """Fixes at 600 m above the ellipsoid, 100 m of geoid: 500 m AMSL, whatever the autopilot has.
-
-    With the separation's sign turned they would be 200 m off, without it 100 m.
-    """
-    scorer = ShadowScorer(100.0)
-    for i in range(100):
-        scorer.compare(position(i * 100 * MS), (*HOME, altitude))
-    score = scorer.score(10 * SECOND, None)
-    assert score.height_m == pytest.approx(500.0 - altitude)
-    assert score.ready is go
-    assert any(r.id is AlertId.SHADOW_HEIGHT for r in score.reasons) is not go
-
-
-def test_nothing_compared_is_a_no_go() -> None:
-    score = ShadowScorer(100.0).score(SECOND, None)
-    assert not score.ready
-    assert score.median_m is score.height_m is score.rate_hz is None
-    assert score.reasons == (alert(AlertId.SHADOW_NOT_COMPARED),)
-
-
-def test_blocked_yaw_is_a_no_go() -> None:
-    scorer = ShadowScorer(100.0)
-    for i in range(100):
-        scorer.compare(position(i * 100 * MS), (*HOME, 500.0))
-    assert scorer.score(10 * SECOND, math.radians(5.0)).reasons == (
-        alert(AlertId.SHADOW_YAW, degrees=pytest.approx(5.0)),
-    )
+    assert (score.median_m is None) is (reason is AlertId.SHADOW_NOT_COMPARED)
 
 
 # --- closed loop --------------------------------------------------------------------------------
@@ -207,30 +191,41 @@ def test_a_jump_after_one_that_was_given_up_is_repeated_again() -> None:
 CONFIG = SourceSwitchConfig(enabled=True, bad_after_s=1.5)
 
 
-def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) -> list[Any]:
-    """Decide ten times a second; orders are acknowledged. how: see the body."""
-    orders = []
-    for i in range(int(seconds * 10)):
-        now = int((start + i / 10) * SECOND) + SECOND
-        gps = how.get("gps", True)
-        state = vehicle(
-            now if gps else 0,
-            gps_fix_type=3 if gps else 0,
-            ekf_flags=GOOD_FLAGS | how.get("flags", 0),
-            gps_h_accuracy_m=how.get("claimed", 1.0),
-            latitude_deg=HOME[0] + how.get("ekf", how.get("north", 0.0)) * METRE,
-            longitude_deg=HOME[1],
-        )
-        seen = now - (100 * MS if how.get("seen", True) else 60 * SECOND)
-        vision = position(seen, how.get("north", 0.0), speed=how.get("speed", 0.0))
-        order = switch.decide(
-            now, state, vision, good=how.get("good", True), may_switch=how.get("proven", True)
-        )
-        if order is not None:
-            orders.append((start + i / 10, order))
-            if how.get("acknowledge", True):
-                switch.acknowledged(True)
-    return orders
+class Switch(SourceSwitch):
+    """Whose orders are acknowledged. told: the alerts."""
+
+    def __init__(self, config: SourceSwitchConfig = CONFIG) -> None:
+        self.told: list[Alert] = []
+        self._sent: list[int] = []
+        commander: Any = SimpleNamespace(send=lambda _, __, number: self._sent.append(number))
+        super().__init__(config, commander, StatusNotifier(self.told.append), Counter())
+
+    def told_of(self, of: AlertId) -> list[tuple[Any, ...]]:
+        return [told.values for told in self.told if told.id is of]
+
+    def drive(self, seconds: float, start: float = 0.0, **how: Any) -> list[tuple[float, int]]:
+        """Decide ten times a second; times and sets of the orders. how: see the body."""
+        orders = []
+        for i in range(int(seconds * 10)):
+            now = int((start + i / 10) * SECOND) + SECOND
+            gps = how.get("gps", True)
+            state = vehicle(
+                now if gps else 0,
+                gps_fix_type=3 if gps else 0,
+                ekf_flags=GOOD_FLAGS | how.get("flags", 0),
+                gps_h_accuracy_m=how.get("claimed", 1.0),
+                latitude_deg=HOME[0] + how.get("ekf", how.get("north", 0.0)) * METRE,
+                longitude_deg=HOME[1],
+            )
+            seen = now - (100 * MS if how.get("seen", True) else 60 * SECOND)
+            vision = position(seen, how.get("north", 0.0), speed=how.get("speed", 0.0))
+            good, may_switch = how.get("good", True), how.get("proven", True)
+            link: Any = None
+            self.tick(link, state, vision, good=good, may_switch=may_switch, now_ns=now)
+            if self._sent:
+                orders.append((start + i / 10, self._sent.pop()))
+                self.acknowledged(True)
+        return orders
 
 
 @pytest.mark.parametrize(
@@ -242,83 +237,84 @@ def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) 
     ],
 )
 def test_bad_gnss_switches_once_to_vision(how: dict[str, Any], reason: str) -> None:
-    switch = SourceSwitch(CONFIG)
-    assert drive(switch, 5.0) == []
-    orders = drive(switch, 6.0, 5.0, **how)
-    assert [(o.source_set, o.cause) for _, o in orders] == [(2, reason)]
-    assert orders[0][0] == pytest.approx(6.5, abs=0.15)
+    switch = Switch()
+    assert switch.drive(5.0) == []
+    ((ordered_s, source_set),) = switch.drive(6.0, 5.0, **how)
+    assert ordered_s == pytest.approx(6.5, abs=0.15)
+    assert source_set == 2
+    assert [values[:2] for values in switch.told_of(AlertId.SOURCE_SET_SELECTED)] == [(2, reason)]
     assert switch.current == 2
 
 
 def test_short_fault_switches_nothing() -> None:
-    switch = SourceSwitch(CONFIG)
+    switch = Switch()
     for i in range(10):
-        assert drive(switch, 1.0, 4.0 * i, gps=False) == []
-        assert drive(switch, 3.0, 4.0 * i + 1.0) == []
+        assert switch.drive(1.0, 4.0 * i, gps=False) == []
+        assert switch.drive(3.0, 4.0 * i + 1.0) == []
 
 
-def test_fast_flight_is_no_inconsistency() -> None:
-    assert drive(SourceSwitch(CONFIG), 5.0, north=8.0, speed=15.0) == []
+@pytest.mark.parametrize(
+    ("config", "how"),
+    [
+        (CONFIG, {"north": 8.0, "speed": 15.0}),  # the lag of a fast flight
+        (CONFIG, {"gps": False, "good": False}),  # to vision that is not good
+        (CONFIG, {"north": 20.0, "claimed": 12.0}),
+        (SourceSwitchConfig(), {"gps": False}),  # disabled
+    ],
+)
+def test_what_switches_nothing(config: SourceSwitchConfig, how: dict[str, Any]) -> None:
+    assert Switch(config).drive(10.0, **how) == []
 
 
-def test_no_switch_to_vision_that_is_not_good() -> None:
-    assert drive(SourceSwitch(CONFIG), 5.0, gps=False, good=False) == []
+def test_a_receiver_that_claims_to_be_bad_hides_nothing() -> None:
+    switch = Switch()
+    switch.drive(5.0, north=60.0, claimed=12.0)
+    assert [why for _, why, _ in switch.told_of(AlertId.SOURCE_SET_SELECTED)] == ["GNSS off vision"]
 
 
 def test_back_to_gnss_only_if_configured_and_once_it_was_compared() -> None:
-    never = SourceSwitch(CONFIG)
-    drive(never, 5.0, gps=False)
-    assert drive(never, 60.0, 5.0) == []
-    back = SourceSwitch(CONFIG.model_copy(update={"return_to_gnss": True}))
-    drive(back, 5.0, gps=False)
+    never = Switch()
+    never.drive(5.0, gps=False)
+    assert never.drive(60.0, 5.0) == []
+    back = Switch(CONFIG.model_copy(update={"return_to_gnss": True}))
+    back.drive(5.0, gps=False)
     for i in range(5):
         # A receiver that comes and goes does not bring it back.
-        assert drive(back, 4.5, 5.0 + 10 * i) == []
-        assert drive(back, 5.5, 9.5 + 10 * i, gps=False) == []
-    orders = drive(back, 10.0, 55.0)
-    assert [order.source_set for _, order in orders] == [1]
+        assert back.drive(4.5, 5.0 + 10 * i) == []
+        assert back.drive(5.5, 9.5 + 10 * i, gps=False) == []
+    orders = back.drive(10.0, 55.0)
+    assert [source_set for _, source_set in orders] == [1]
 
 
 def test_no_return_to_a_far_receiver_of_which_nobody_says_that_it_is_bad() -> None:
     """Vision ended, and with it the only word against a spoofed receiver that says it is well."""
-    back = SourceSwitch(CONFIG.model_copy(update={"return_to_gnss": True}))
-    drive(back, 5.0, north=60.0)
+    back = Switch(CONFIG.model_copy(update={"return_to_gnss": True}))
+    back.drive(5.0, north=60.0)
     assert back.current == 2
-    assert drive(back, 60.0, 5.0, seen=False, ekf=60.0) == []
-    orders = drive(back, 12.0, 65.0)
-    assert [order.source_set for _, order in orders] == [1]
+    assert back.drive(60.0, 5.0, seen=False, ekf=60.0) == []
+    orders = back.drive(12.0, 65.0)
+    assert [source_set for _, source_set in orders] == [1]
 
 
-@pytest.mark.parametrize("how", [{"gps": False}, {"flags": 32768}, {"north": 12.0}])
-def test_no_switch_without_a_go_of_the_shadow_score(how: dict[str, Any]) -> None:
-    switch = SourceSwitch(CONFIG)
-    assert drive(switch, 10.0, proven=False, **how) == []
-    assert switch.refusal.values[2] == "not ready"
-
-
-def test_a_receiver_that_claims_to_be_bad_hides_nothing() -> None:
-    orders = drive(SourceSwitch(CONFIG), 5.0, north=60.0, claimed=12.0)
-    assert [order.cause for _, order in orders] == ["GNSS off vision"]
-    assert drive(SourceSwitch(CONFIG), 5.0, north=20.0, claimed=12.0) == []
+def test_no_switch_without_a_go_of_the_shadow_score() -> None:
+    switch = Switch()
+    assert switch.drive(10.0, proven=False, gps=False) == []
+    assert {why for *_, why in switch.told_of(AlertId.SOURCE_SET_HELD)} == {"not ready"}
 
 
 def test_back_to_sound_gnss_once_vision_is_gone() -> None:
-    switch = SourceSwitch(CONFIG)
-    drive(switch, 5.0, gps=False)
-    assert drive(switch, 20.0, 5.0, gps=False, seen=False) == []
-    orders = drive(switch, 6.0, 25.0, seen=False)
-    assert [order.source_set for _, order in orders] == [1]
+    switch = Switch()
+    switch.drive(5.0, gps=False)
+    assert switch.drive(20.0, 5.0, gps=False, seen=False) == []
+    orders = switch.drive(6.0, 25.0, seen=False)
+    assert [source_set for _, source_set in orders] == [1]
     assert orders[0][0] == pytest.approx(28.0, abs=0.2)
-    other = SourceSwitch(CONFIG)
-    drive(other, 5.0, gps=False)
+    other = Switch()
+    other.drive(5.0, gps=False)
     # Not to one that is far from where the vehicle went by itself, and not for a gap in vision.
-    assert drive(other, 20.0, 5.0, seen=False, ekf=60.0) == []
-    drive(other, 5.0, 25.0, ekf=60.0)
-    assert drive(other, 2.0, 30.0, seen=False) == []
-
-
-def test_disabled_does_nothing() -> None:
-    assert drive(SourceSwitch(SourceSwitchConfig()), 10.0, gps=False) == []
+    assert other.drive(20.0, 5.0, seen=False, ekf=60.0) == []
+    other.drive(5.0, 25.0, ekf=60.0)
+    assert other.drive(2.0, 30.0, seen=False) == []
 
 
 # --- a receiver that returns --------------------------------------------------------------------
@@ -385,12 +381,12 @@ def test_a_wrong_receiver_is_refused_with_its_reason(how: dict[str, Any], why: s
 
 def test_what_was_refused_is_not_taken_when_vision_ends() -> None:
     """20 m from where the EKF came by itself would do, but vision had said that it is wrong."""
-    switch = SourceSwitch(CONFIG)
-    drive(switch, 5.0, gps=False)
-    drive(switch, 5.0, 5.0, north=20.0)
-    assert drive(switch, 20.0, 10.0, north=20.0, seen=False) == []
-    drive(switch, 5.0, 30.0, gps=False, seen=False)
-    assert [o.source_set for _, o in drive(switch, 8.0, 35.0, seen=False)] == [1]
+    switch = Switch()
+    switch.drive(5.0, gps=False)
+    switch.drive(5.0, 5.0, north=20.0)
+    assert switch.drive(20.0, 10.0, north=20.0, seen=False) == []
+    switch.drive(5.0, 30.0, gps=False, seen=False)
+    assert [source_set for _, source_set in switch.drive(8.0, 35.0, seen=False)] == [1]
 
 
 # --- Who opens and closes the gate of mode ``rc``: the newest word of channel or command --------
@@ -408,22 +404,16 @@ def channels(pulse: int, count: int = 18) -> tuple[int, ...]:
     return tuple(pulse if i == 9 else 1500 for i in range(1, count + 1))
 
 
-def test_channel_is_followed_and_each_change_is_told_once() -> None:
-    it, told = enable()
-    for pulse in (1100, 1100, 1900, 1900, 1100, 1100):
-        it.on_rc_channels(channels(pulse))
-    assert told == [
-        alert(of, by=RcChannel(9)) for of in (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
-    ]
-
-
-def test_a_pulse_at_the_threshold_does_not_flutter() -> None:
+def test_a_pulse_at_the_threshold_does_not_flutter_and_each_change_is_told_once() -> None:
     it, told = enable(inject_above_us=1700)
-    for pulse in (1690, 1705, 1690, 1702, 1655):
+    for pulse in (1100, 1690, 1705, 1690, 1702, 1655):
         it.on_rc_channels(channels(pulse))
-    assert told == [alert(AlertId.INJECTION_ON, by=RcChannel(9))]
-    it.on_rc_channels(channels(1640))
+    assert it.enabled
+    for pulse in (1640, 1640):
+        it.on_rc_channels(channels(pulse))
     assert not it.enabled
+    changes = (AlertId.INJECTION_ON, AlertId.INJECTION_OFF)
+    assert told == [alert(of, by=RcChannel(9)) for of in changes]
 
 
 def test_the_newest_word_counts() -> None:

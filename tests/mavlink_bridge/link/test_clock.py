@@ -8,9 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from mavlink_bridge.link.clock import BootClock, SteadyUtc, utc_us
-
-MS = 1_000_000
-SECOND = 1_000 * MS
+from tests.mavlink_bridge.simulated import MS, SECOND
 
 
 def answers(
@@ -102,32 +100,29 @@ def test_minimum_lag_bounds_the_offset_before_timesync() -> None:
     assert clock.source == "minimum lag"
 
 
-def test_implausible_timesync_answers_are_refused() -> None:
+def test_implausible_timesync_answers_are_refused_and_stamps_never_later_than_their_arrival():
     clock = BootClock()
     assert not clock.timesync(0, 10 * SECOND, 9 * SECOND)
     assert not clock.timesync(0, 10 * SECOND, 12 * SECOND)
     assert clock.offset_ns is None
-
-
-def test_stamps_are_never_later_than_their_arrival() -> None:
-    clock = BootClock()
     clock.timesync(0, 10 * SECOND, 10 * SECOND + 2 * MS)
     assert clock.to_monotonic(5 * SECOND, 12 * SECOND) == 12 * SECOND
 
 
-def test_gps_week_of_a_known_moment() -> None:
-    # 2024-01-01T00:00:00 UTC is GPS week 2295, second 86418 (18 leap seconds into Monday).
-    utc = SteadyUtc(utc_ns=1_704_067_200 * SECOND, at_monotonic_ns=0)
-    assert utc.gps_week_ms(0) == (2295, 86_418_000)
-    assert utc.gps_week_ms(250 * MS) == (2295, 86_418_250)
-
-
-@pytest.mark.parametrize("before_ms", [1, 0])
-def test_gps_week_rolls_over_with_its_milliseconds(before_ms: int) -> None:
-    start = 315_964_800 - 18 + 2400 * 604_800  # of GPS week 2400, UTC
-    utc = SteadyUtc(utc_ns=start * SECOND, at_monotonic_ns=0)
-    expected = (2399, 604_799_999) if before_ms else (2400, 0)
-    assert utc.gps_week_ms(-before_ms * MS) == expected
+@pytest.mark.parametrize(
+    ("utc_s", "ms", "expected"),
+    [
+        # 2024-01-01T00:00:00 UTC is GPS week 2295, second 86418 (18 leap seconds into Monday).
+        (1_704_067_200, 0, (2295, 86_418_000)),
+        (1_704_067_200, 250, (2295, 86_418_250)),
+        # The start of GPS week 2400.
+        (315_964_800 - 18 + 2400 * 604_800, -1, (2399, 604_799_999)),
+        (315_964_800 - 18 + 2400 * 604_800, 0, (2400, 0)),
+    ],
+)
+def test_gps_week_of_a_known_moment(utc_s: int, ms: int, expected: tuple[int, int]) -> None:
+    utc = SteadyUtc(utc_ns=utc_s * SECOND, at_monotonic_ns=0)
+    assert utc.gps_week_ms(ms * MS) == expected
 
 
 def test_a_clock_that_was_never_set_gives_no_gps_time() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -115,7 +113,8 @@ def test_a_disk_that_stalls_does_not_stall_the_sender(tmp_path, monkeypatch):
         def close(self) -> None:
             closed.set()
 
-    recorder = TlogRecorder(tmp_path / "a.tlog", open_file=lambda _: Stalled())
+    monkeypatch.setattr(Path, "open", lambda *_, **__: Stalled())
+    recorder = TlogRecorder(tmp_path / "a.tlog")
     recorder.start()
     recorder.write(frame(0), 0)
     assert writing.wait(30.0)
@@ -132,7 +131,7 @@ def test_a_disk_that_stalls_does_not_stall_the_sender(tmp_path, monkeypatch):
     assert recorder.dropped == 0
 
 
-def test_mavlogdump_and_mavutil_read_every_frame(tmp_path: Path) -> None:
+def test_mavutil_reads_every_frame(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     recorder = TlogRecorder(path)
     recorder.start()
@@ -147,16 +146,6 @@ def test_mavlogdump_and_mavutil_read_every_frame(tmp_path: Path) -> None:
     log.close()
     assert [boot for boot, _ in stamps] == list(range(200))
     assert stamps[-1][1] - begun == pytest.approx(0.02 * 199, abs=1e-3)
-    tool = Path(sys.executable).with_name("mavlogdump.py")
-    printed = subprocess.run(
-        [sys.executable, tool, "--types", "ATTITUDE", "--format", "csv", path],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60.0,
-    ).stdout.splitlines()
-    assert len(printed) == 201  # and the header
-    assert "ATTITUDE.time_boot_ms" in printed[0]
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "endless"])

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from scipy.spatial.transform import Rotation
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
@@ -18,15 +20,11 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.status_notifier import StatusNotifier
-from mavlink_bridge.vehicle.origin import OriginKeeper, north_east
+from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
-from mavlink_bridge.vehicle.readings import gimbal_in_earth_frame
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
-
-MS = 1_000_000
-SECOND = 1_000 * MS
-Quaternion = Callable[[float, float, float], list[float]]
+from tests.mavlink_bridge.simulated import MS, SECOND, exchanging
 
 
 def sent(message: Any, system: int = 1, component: int = 1) -> Any:
@@ -63,7 +61,7 @@ def test_attitude_is_interpolated_across_the_wrap_of_yaw() -> None:
         assert quat.wrap_pi(at.yaw_rad - expected) == pytest.approx(0.0, abs=1e-4)
 
 
-def test_attitude_is_extrapolated_a_little_and_not_more() -> None:
+def test_attitude_is_extrapolated_a_little_and_a_gap_is_none() -> None:
     it = tracker()
     feed_yaw(it, 10.0, 1.0, 0.5)
     newest = 10 * SECOND + 900 * MS
@@ -71,6 +69,12 @@ def test_attitude_is_extrapolated_a_little_and_not_more() -> None:
     assert at.yaw_rad == pytest.approx(0.5 * 0.98, abs=1e-4)
     assert it.attitude_at(newest + 200 * MS) is None
     assert it.attitude_at(10 * SECOND - 50 * MS) is None
+    q = quat.from_euler(0.1, -0.2, 2.0)
+    later = mavlink.MAVLink_attitude_quaternion_message(1700, *q, 0.0, 0.0, 0.0)
+    it.handle(sent(later), newest + 800 * MS)
+    assert it.attitude_at(newest + 400 * MS) is None
+    at = it.attitude_at(newest + 800 * MS)
+    assert (at.roll_rad, at.pitch_rad, at.yaw_rad) == pytest.approx((0.1, -0.2, 2.0), abs=1e-6)
 
 
 def test_gyro_heading_follows_the_turn_and_ignores_resets_of_the_estimator() -> None:
@@ -85,26 +89,21 @@ def test_gyro_heading_follows_the_turn_and_ignores_resets_of_the_estimator() -> 
     assert late.gyro_heading_rad - early.gyro_heading_rad == pytest.approx(rate * 8.0, abs=1e-3)
 
 
-def test_gap_in_the_attitudes_is_no_attitude() -> None:
-    it = tracker()
-    for ms in (0, 100, 900, 1000):
-        m = mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
-        it.handle(sent(m), 10 * SECOND + ms * MS)
-    assert it.attitude_at(10 * SECOND + 500 * MS) is None
-    assert it.attitude_at(10 * SECOND + 950 * MS) is not None
-
-
-def test_attitude_quaternion_message() -> None:
-    it = tracker()
-    q = quat.from_euler(0.1, -0.2, 2.0)
-    it.handle(
-        sent(mavlink.MAVLink_attitude_quaternion_message(5000, *q, 0.0, 0.0, 0.0)), 10 * SECOND
-    )
-    at = it.attitude_at(10 * SECOND)
-    assert (at.roll_rad, at.pitch_rad, at.yaw_rad) == pytest.approx((0.1, -0.2, 2.0), abs=1e-6)
-
-
 YAW_LOCK, IN_VEHICLE, IN_EARTH = 16, 32, 64
+
+
+def attitude_and(it: VehicleTracker, ms: int, *messages: Any, yaw_deg: float = 0.0) -> None:
+    yaw = math.radians(yaw_deg)
+    attitude = mavlink.MAVLink_attitude_message(ms, 0.05, 0.02, yaw, 0.0, 0.0, 0.0)
+    for m in (attitude, *messages):
+        it.handle(sent(m), 10 * SECOND + ms * MS)
+
+
+def device_status(ms: int, flags: int, pitch: float, yaw: float, device: int = 0) -> Any:
+    q = Rotation.from_euler("ZYX", [yaw, pitch, 0.0], degrees=True).as_quat()
+    return mavlink.MAVLink_gimbal_device_attitude_status_message(
+        0, 0, ms, flags, list(np.roll(q, 1)), 0.0, 0.0, 0.0, 0, math.nan, math.nan, device
+    )
 
 
 @pytest.mark.parametrize(
@@ -118,47 +117,26 @@ YAW_LOCK, IN_VEHICLE, IN_EARTH = 16, 32, 64
         (YAW_LOCK | IN_EARTH, True),
     ],
 )
-def test_gimbal_frame_by_yaw_in_flags_first_then_yaw_lock(flags, earth, quaternion_of):
-    assert gimbal_in_earth_frame(flags) is earth
+def test_gimbal_frame_by_yaw_in_flags_first_then_yaw_lock(flags, earth):
     it = tracker()
-    vehicle_yaw = 100.0
     for ms in (0, 100, 200):
-        attitude = mavlink.MAVLink_attitude_message(
-            ms, 0.05, 0.02, math.radians(vehicle_yaw), 0.0, 0.0, 0.0
-        )
-        it.handle(sent(attitude), 10 * SECOND + ms * MS)
-        q = quaternion_of(0.0, -45.0, 30.0)
-        gimbal = mavlink.MAVLink_gimbal_device_attitude_status_message(
-            0, 0, ms, flags, q, 0.0, 0.0, 0.0, 0, math.nan, math.nan
-        )
-        it.handle(sent(gimbal), 10 * SECOND + ms * MS)
+        attitude_and(it, ms, device_status(ms, flags, -45.0, 30.0), yaw_deg=100.0)
     at = it.gimbal_at(10 * SECOND + 150 * MS)
-    yaw = 30.0 if earth else 130.0
-    assert math.degrees(at.yaw_rad) == pytest.approx(yaw, abs=1e-3)
+    assert math.degrees(at.yaw_rad) == pytest.approx(30.0 if earth else 130.0, abs=1e-3)
     assert math.degrees(at.pitch_rad) == pytest.approx(-45.0, abs=1e-3)
     assert at.source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
 
 
-def attitude_and(it: VehicleTracker, ms: int, *messages: Any, yaw: float = 0.0) -> None:
-    attitude = mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, yaw, 0.0, 0.0, 0.0)
-    for m in (attitude, *messages):
-        it.handle(sent(m), 10 * SECOND + ms * MS)
-
-
-def test_old_mount_messages_are_used_only_without_the_new_one(quaternion_of: Quaternion) -> None:
+def test_old_mount_messages_are_used_only_without_the_new_one() -> None:
     it = tracker()
     mount = mavlink.MAVLink_mount_status_message(0, 0, -3000, 100, 2000)
     for ms in (0, 100, 200):
-        attitude_and(it, ms, mount, yaw=math.radians(10.0))
+        attitude_and(it, ms, mount, yaw_deg=10.0)
     at = it.gimbal_at(10 * SECOND + 100 * MS)
     assert at.source == "MOUNT_STATUS"
-    assert math.degrees(at.pitch_rad) == pytest.approx(-30.0, abs=1e-3)
-    assert math.degrees(at.roll_rad) == pytest.approx(1.0, abs=1e-3)
-    assert math.degrees(at.yaw_rad) == pytest.approx(30.0, abs=1e-3)
-    device = mavlink.MAVLink_gimbal_device_attitude_status_message(
-        0, 0, 300, IN_EARTH, quaternion_of(0.0, -80.0, 0.0), 0.0, 0.0, 0.0, 0, math.nan, math.nan
-    )
-    attitude_and(it, 300, device, mount)
+    angles = np.degrees([at.roll_rad, at.pitch_rad, at.yaw_rad])
+    assert angles == pytest.approx([1.0, -30.0, 30.0], abs=1e-3)
+    attitude_and(it, 300, device_status(300, IN_EARTH, -80.0, 0.0), mount)
     attitude_and(it, 400, mount)
     at = it.gimbal_at(10 * SECOND + 350 * MS)
     assert at.source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
@@ -210,30 +188,12 @@ def test_between_two_places_the_way_over_the_date_line_is_the_short_one(before, 
     assert -180.0 <= found[1] <= 180.0
 
 
-def test_what_is_not_finite_or_old_is_ignored() -> None:
+def test_a_copy_of_an_old_frame_does_not_turn_the_position_back() -> None:
     it = tracker()
-    feed_yaw(it, 10.0, 1.0, 0.0)
-    now = 11 * SECOND
-    nan = math.nan
-    for m in (
-        mavlink.MAVLink_attitude_message(950, nan, 0.0, 0.0, 0.0, 0.0, 0.0),
-        mavlink.MAVLink_attitude_quaternion_message(960, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        mavlink.MAVLink_local_position_ned_message(970, nan, 0.0, 0.0, 0.0, 0.0, 0.0),
-        mavlink.MAVLink_global_position_int_message(980, 1_000_000_000, 5, 0, 0, 0, 0, 0, 0),
-    ):
-        it.handle(sent(m), now)
-    assert it.ignored == 4
-    state = it.snapshot(now)
-    assert state.local_position_ned is None
-    assert state.latitude_deg is None
-    at = it.attitude_at(now - 100 * MS)
-    assert math.isfinite(at.yaw_rad)
-    # A copy of an old frame does not turn the position back.
-    good = mavlink.MAVLink_local_position_ned_message(1000, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    it.handle(sent(good), now)
-    old = mavlink.MAVLink_local_position_ned_message(500, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    it.handle(sent(old), now + 3 * SECOND)
-    assert it.snapshot(now).local_position_ned == (5.0, 0.0, 0.0)
+    for ms, north, later in ((1000, 5.0, 0), (500, 1.0, 3)):
+        m = mavlink.MAVLink_local_position_ned_message(ms, north, 0.0, 0.0, 0.0, 0.0, 0.0)
+        it.handle(sent(m), (11 + later) * SECOND)
+    assert it.snapshot(11 * SECOND).local_position_ned == (5.0, 0.0, 0.0)
 
 
 def test_what_a_hard_flight_measures_is_taken() -> None:
@@ -294,26 +254,22 @@ def test_scaling_is_ardupilots_own() -> None:
 
 def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     configured = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
-    keeper = OriginKeeper(configured)
-    asked: list[int] = []
-    messages = [keeper.tick(i * SECOND, 1, asked.append) for i in range(1, 6)]
-    assert asked == [49] * 5
-    assert messages[:3] == [None] * 3
-    assert messages[3] is not None
-    assert messages[3].latitude == 470000000
-    assert messages[3].altitude == 500000
+    exchange, link, told = exchanging(configured)
+    for second in range(1, 6):
+        exchange.tick(link, second * SECOND, may_set=True)
+    kinds = [m.get_type() for _, m, _ in link.sent]
+    assert kinds == [*["COMMAND_LONG"] * 4, "SET_GPS_GLOBAL_ORIGIN", "COMMAND_LONG"]
+    assert {m.param1 for _, m, _ in link.sent if m.get_type() == "COMMAND_LONG"} == {49}
+    # What firmwares send before they have one.
+    exchange.on_message(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), 6 * SECOND)
+    assert exchange.origin is None
     # The vehicle has another one: ours is ignored, and so must positions be relative to the read.
     read = mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000)
-    news = keeper.on_origin(read, armed=True)
-    assert news.id is AlertId.ORIGIN_DIFFERS
-    assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
-    assert keeper.tick(10 * SECOND, 1, asked.append) is None
-
-
-def test_zero_origin_is_none() -> None:
-    keeper = OriginKeeper(None)
-    keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), armed=False)
-    assert keeper.origin is None
+    exchange.on_message(read, 6 * SECOND)
+    assert [a.id for a in told] == [AlertId.ORIGIN_DIFFERS]
+    assert exchange.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
+    exchange.tick(link, 10 * SECOND, may_set=True)
+    assert len(link.sent) == 7  # only asked again
 
 
 # --- profiles ---------------------------------------------------------------------------------
@@ -336,28 +292,19 @@ def test_profile_of_a_firmware(autopilot: str, version: Any, profile: Any) -> No
     assert select_profile(autopilot, version) is profile
 
 
-def gimbal_status(it: VehicleTracker, at_ms: int, yaw_deg: float, who: tuple[int, int]) -> None:
-    """GIMBAL_DEVICE_ATTITUDE_STATUS of (component, device), yaw from the vehicle's heading."""
-    component, device = who
-    q = quat.from_euler(0.0, -0.5, math.radians(yaw_deg))
-    m = mavlink.MAVLink_gimbal_device_attitude_status_message(
-        0, 0, at_ms, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, list(q), 0, 0, 0, 0,
-        gimbal_device_id=device,
-    )  # fmt: skip
-    message = sent(m, component=component)
-    assert it.accepts(message)
-    it.handle(message, 10 * SECOND + at_ms * MS)
-
-
 def fly_level(
     it: VehicleTracker, seconds: float, speaks: Callable[[int], dict[tuple[int, int], float]]
 ) -> None:
-    """Attitudes at 20 Hz, and the angles of whoever speaks at a time in ms, by gimbal."""
+    """Attitudes at 20 Hz, and the yaw from the vehicle's heading of whoever speaks at a time in ms:
+    (component, device).
+    """
     for at_ms in range(0, round(seconds * 1000), 50):
-        m = mavlink.MAVLink_attitude_message(at_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        it.handle(sent(m), 10 * SECOND + at_ms * MS)
-        for who, yaw_deg in speaks(at_ms).items():
-            gimbal_status(it, at_ms, yaw_deg, who)
+        attitude_and(it, at_ms)
+        for (component, device), yaw_deg in speaks(at_ms).items():
+            status = device_status(at_ms, IN_VEHICLE, -30.0, yaw_deg, device)
+            message = sent(status, component=component)
+            assert it.accepts(message)
+            it.handle(message, 10 * SECOND + at_ms * MS)
 
 
 CAMERA_GIMBAL, OTHER_GIMBAL = (1, 1), (1, 2)

@@ -197,6 +197,8 @@ def test_ekf_target_and_stage_errors():
     np.testing.assert_allclose(target_errors(targets, truth, (0, 5))["a"], [1.0])
     assert targets_inside(targets, truth, (0, 5)) == 50.0  # 1 m at a sigma of 0.32 m is outside
     assert targets_inside(targets, {}, (0, 5)) is None
+    assert [len(e) for e in target_errors({}, truth, (0, 5)).values()] == [0, 0]
+    assert targets_inside({}, truth, (0, 5)) is None
     stages = stage_latencies({"exposure_time_ns": np.array([0, 9]), "x_ms": np.array([4.0, 8.0])},
                              (0, 5))  # fmt: skip
     assert stages["x"].median == 4.0

@@ -14,7 +14,8 @@ from sitl.demo.companion_process import Ports, write_deployment
 from sitl.demo.flight import fly
 from sitl.demo.report import make_report, print_report
 from sitl.demo.scenario import CameraSpec, Injection, Scenario, ScenarioLeg
-from sitl.demo.script import FlightError, FlightScript
+from sitl.demo.script import FlightScript
+from sitl.errors import FlightError
 
 # Light and low, because it flies in real time on what may be two cores.
 SCENARIO = Scenario(
@@ -87,7 +88,7 @@ class _BreaksOff(FlightScript):
     """Ends once the companion is up, as a flight that is lost does."""
 
     def fly(self):
-        self.await_companion()
+        self.companion.wait_up()
         raise FlightError("the vehicle left AUTO for LAND: no position")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
@@ -38,10 +37,8 @@ def offset_m(survey: TopView, satellite: TopView, row: int, column: int, half: i
     return np.array([found[1], -found[0]]) * GSD_M
 
 
-@pytest.mark.parametrize(("off_nadir_deg", "azimuth_deg"), [(12.0, 180.0), (25.0, 270.0)])
-def test_ground_stays_and_roofs_lean_away_from_the_satellite(
-    small_assets, tmp_path, off_nadir_deg, azimuth_deg
-):
+def test_ground_stays_and_roofs_lean_away_from_the_satellite(small_assets, tmp_path):
+    off_nadir_deg, azimuth_deg = 18.0, 240.0
     spec = SatelliteMap(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth_deg, blur_px=0.8)
     build_satellite_map(small_assets.world, small_assets.map_cache, spec, tmp_path / "map")
     kind = TileCache.open(tmp_path / "map").manifest.kind

@@ -143,31 +143,23 @@ def test_gyros_settle_for_25_seconds(bench, vision_only, home):
     assert b.failures() == []
 
 
-def test_gps_parameters_without_gps(bench):
-    b = guided(bench({"SIM_GPS1_ENABLE": 0}))
-    b.run(60)
-    assert "GPS 1: Bad fix" in b.failures()
-    assert "Need Position Estimate" in b.failures()
-
-
-def test_no_origin(bench, vision_only):
-    b = guided(bench(vision_only))
-    b.vision()
-    b.run(30)
-    assert "AHRS: waiting for home" in b.failures()
-
-
-def test_velocity_sources_left_at_gps(bench, vision_only, home):
-    b = guided(bench({**vision_only, "EK3_SRC1_VELXY": 3}), home)
-    b.vision()
-    b.run(30)
-    assert "AHRS: EK3 sources require GPS" in b.failures()
-
-
-def test_vision_sources_without_vision_configured(bench, vision_only, home):
-    b = guided(bench({**vision_only, "VISO_TYPE": 0}), home)
-    b.run(30)
-    assert "AHRS: EK3 sources require VisualOdom" in b.failures()
+@pytest.mark.parametrize(
+    ("parameters", "vision", "told"),
+    [
+        ({"SIM_GPS1_ENABLE": 0}, None, {"GPS 1: Bad fix", "Need Position Estimate"}),
+        ({}, "no origin", {"AHRS: waiting for home"}),
+        ({"EK3_SRC1_VELXY": 3}, "sent", {"AHRS: EK3 sources require GPS"}),
+        ({"VISO_TYPE": 0}, "sent", {"AHRS: EK3 sources require VisualOdom"}),
+    ],
+    ids=["no GNSS", "no origin", "velocity from GNSS", "no vision configured"],
+)
+def test_what_is_missing_is_named(bench, vision_only, home, parameters, vision, told):
+    b = bench({**(vision_only if vision else {}), **parameters})
+    guided(b, home if vision == "sent" else None)
+    if vision:
+        b.vision()
+    b.run(60 if vision is None else 30)
+    assert told <= set(b.failures())
 
 
 def test_a_gap_over_300_ms(bench, vision_only, home):

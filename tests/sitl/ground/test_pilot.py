@@ -97,7 +97,7 @@ def folders(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("end", [None, PilotError("not armed"), KeyboardInterrupt(), SystemExit(1)])
 def test_a_vehicles_folder_goes_with_its_end(folders, end):
-    with pytest.raises(type(end)) if end else contextlib.nullcontext(), _Idle() as vehicle:
+    with pytest.raises(type(end)) if end else contextlib.nullcontext(), _Idle(HOME) as vehicle:
         assert len(list(folders.iterdir())) == 1
         assert "SERIAL2" in vehicle.log_tail()
         if end:
@@ -127,7 +127,7 @@ def test_a_start_that_is_interrupted_leaves_neither_process_nor_folder(folders, 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            _Idle().start()
+            _Idle(HOME).start()
     finally:
         signal.signal(signal.SIGINT, before)
     assert None not in [child.poll() for child in started]
@@ -136,8 +136,8 @@ def test_a_start_that_is_interrupted_leaves_neither_process_nor_folder(folders, 
 
 def test_a_vehicle_does_not_outlive_a_killed_parent():
     script = (
-        "import time; from tests.sitl.ground.test_pilot import _Idle; v = _Idle(); v.start();"
-        "print(v.processes[0].pid, flush=True); time.sleep(600)"
+        "import time; from tests.sitl.ground.test_pilot import HOME, _Idle; v = _Idle(HOME);"
+        "v.start(); print(v.processes[0].pid, flush=True); time.sleep(600)"
     )
     root = Path(__file__).resolve().parents[3]
     parent = subprocess.Popen(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -32,8 +33,9 @@ def chase(small_assets: FlightAssets) -> Chase:
 def test_an_operator_who_cannot_begin_fails_the_flight(small_assets: FlightAssets) -> None:
     """Without its link the thread died with a traceback, and the flight had no operator."""
     pursuer = Pursuer(small_assets, CAMERA, 100.0, 0)
-    context: Any = SimpleNamespace(vehicle=SimpleNamespace(spare_endpoint="nonsense", check=None))
-    with pursuer.take_part(context):
+    vehicle: Any = SimpleNamespace(spare_endpoint="nonsense", check=None)
+    pilot: Any = None
+    with pursuer.take_part(vehicle, pilot, Path("frames.csv")):
         pass
     assert pursuer.failure
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
 from sitl.demo.assets import FlightAssets
 from sitl.demo.flight import home_of
@@ -122,12 +121,10 @@ def test_without_a_mission_a_triangle_is_flown_and_without_a_live_map_it_is_said
 
 
 @pytest.mark.real
-def test_a_real_mesh_is_rehearsed_over(real_data, tmp_path):
+def test_a_real_mesh_is_rehearsed_over(quito_map):
     """Its home is on the surface, its points are seen, its cache is what the camera gets."""
-    cache = tmp_path / "quito"
-    build_cache(real_data("quito") / "tileset.json", cache)
-    done = rehearse(cache, None, None, Scenario())
-    opened = TileCache.open(cache)
+    done = rehearse(quito_map, None, None, Scenario())
+    opened = TileCache.open(quito_map)
     low, high = opened.index.box_min[0], opened.index.box_max[0]
     home = opened.frame.ecef_from_enu.inverse @ done.assets.world.frame.ecef_from_enu
     assert np.all(low < home.translation)

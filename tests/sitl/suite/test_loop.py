@@ -16,13 +16,12 @@ from mavlink_bridge.alerts.catalogue import cleared as cleared_alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Output
 from sitl.__main__ import app
+from sitl.demo.companion_process import FlightCompanion
 from sitl.demo.scenario import ScenarioError
-from sitl.demo.script import FlightError
-from sitl.errors import SimulationError
+from sitl.errors import FlightError, SimulationError
 from sitl.suite.checks import AlertExpectation
 from sitl.suite.loop import runner
 from sitl.suite.loop.case import Expectation, LoopCase, load_loop_cases
-from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.evaluation import (
     LoopExpectationResult,
     LoopRecord,
@@ -202,66 +201,62 @@ def test_the_flights_of_several_runs_make_one_table(tmp_path: Path) -> None:
             read_rows(path)
 
 
-def test_a_resumed_run_flies_what_is_missing_and_what_was_not_flown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    flown: list[tuple[str, int]] = []
-    broken: set[tuple[str, int]] = {("killed", 2)}
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Flights by name and seed, which are not flown: seed 2 is 50 m off, seed 3 cannot be flown."""
+    made: list[tuple[str, int]] = []
 
     def fly(case: LoopCase, _assets: Any, _kind: str, seed: int, out: Path) -> LoopRecord:
-        flown.append((case.name, seed))
-        out.mkdir(parents=True)
-        if (case.name, seed) in broken:
-            raise SimulationError("no arducopter")
-        return record(flight([0.5] * 4))
-
-    monkeypatch.setattr(runner, "fly", fly)
-    monkeypatch.setattr(runner, "loop_assets", lambda *_: None)
-    cases = load_loop_cases(["killed", "frozen-hover"])
-
-    def run(seeds: tuple[int, ...], *, resume: bool = True) -> list[tuple[str, int]]:
-        options = RunOptions(("embedded",), tmp_path, seeds, resume=resume)
-        flown.clear()
-        fly_loop(cases, options, lambda _row: None)
-        return list(flown)
-
-    assert run((1,)) == [("killed", 1), ("frozen-hover", 1)]
-    assert run((1, 2)) == [("killed", 2), ("frozen-hover", 2)]
-    assert run((2,)) == [("killed", 2)]  # it was not flown
-    broken.clear()
-    assert run((1, 2)) == [("killed", 2)]
-    assert run((1, 2)) == []
-    kept = {(row.name, row.seed, row.error) for row in read_rows(tmp_path / "loop.json")}
-    assert kept == {(case.name, seed, "") for case in cases for seed in (1, 2)}
-    assert len(run((1,), resume=False)) == 2
-
-
-def test_the_exit_code_is_that_of_the_flights_asked_for_whether_flown_now_or_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    flown: list[int] = []
-
-    def fly(_case: LoopCase, _assets: Any, _kind: str, seed: int, out: Path) -> LoopRecord:
-        flown.append(seed)
+        made.append((case.name, seed))
         out.mkdir(parents=True)
         if seed == 3:
             raise SimulationError("no arducopter")
-        return record(flight([0.5 if seed == 1 else 50.0] * 40))
+        return record(flight([50.0 if seed == 2 else 0.5] * 40))
 
     monkeypatch.setattr(runner, "fly", fly)
     monkeypatch.setattr(runner, "loop_assets", lambda *_: None)
+    return made
 
+
+def test_a_resumed_run_flies_what_is_missing_and_what_was_not_flown(
+    tmp_path: Path, flown: list[tuple[str, int]]
+) -> None:
+    cases = load_loop_cases(["killed", "frozen-hover"])
+
+    def run(seeds: tuple[int, ...], *, resume: bool = True) -> list[int]:
+        options = RunOptions(("embedded",), tmp_path, seeds, resume=resume)
+        flown.clear()
+        fly_loop(cases, options, lambda _row: None)
+        return [seed for _, seed in flown]
+
+    assert run((1,)) == [1, 1]
+    assert [name for name, _ in flown] == ["killed", "frozen-hover"]
+    assert run((1, 2)) == [2, 2]
+    assert run((1, 2)) == []
+    assert run((3,)) == run((3,)) == [3, 3]  # it was not flown
+    kept = [(row.name, row.seed, not row.error) for row in read_rows(tmp_path / "loop.json")]
+    wanted = [(case.name, seed, seed < 3) for case in cases for seed in (1, 2, 3)]
+    assert sorted(kept) == sorted(wanted)
+    assert run((1,), resume=False) == [1, 1]
+
+
+def test_the_exit_code_is_that_of_the_flights_asked_for_whether_flown_now_or_before(
+    tmp_path: Path, flown: list[tuple[str, int]]
+) -> None:
     def code(seeds: str, *options: str) -> int:
         flown.clear()
         command = ["loop", "--only", "frozen-hover", "--seeds", seeds, "--out", str(tmp_path)]
         return CliRunner().invoke(app, [*command, *options]).exit_code
 
-    assert (code("1..2"), flown) == (1, [1, 2])
-    assert (code("1..2", "--resume"), flown) == (1, [])
-    assert (code("2", "--resume"), flown) == (1, [])
-    assert (code("1", "--resume"), flown) == (0, [])
-    assert (code("3", "--resume"), flown) == (1, [3])
-    assert (code("1", "--resume"), flown) == (0, [])
+    for seeds, options, expected, now in (
+        ("1..2", (), 1, [1, 2]),
+        ("1..2", ("--resume",), 1, []),
+        ("2", ("--resume",), 1, []),
+        ("1", ("--resume",), 0, []),
+        ("3", ("--resume",), 1, [3]),
+        ("1", ("--resume",), 0, []),
+    ):
+        assert (code(seeds, *options), [seed for _, seed in flown]) == (expected, now)
 
 
 def test_alerts_are_judged_by_their_time_and_listed() -> None:
@@ -296,9 +291,9 @@ def test_the_shipped_flights_hold_together(tmp_path: Path) -> None:
     assert len(normal) >= 6
     assert all(case.name.startswith("normal") for case in normal)
     assert all(case.expect.silent for case in normal)
-    with pytest.raises(ScenarioError, match="holds no flights"):
+    with pytest.raises(ScenarioError, match="holds no scenario files"):
         load_loop_cases(folder=tmp_path / "nowhere")
-    with pytest.raises(ScenarioError, match="no nowhere"):
+    with pytest.raises(ScenarioError, match="no scenario nowhere"):
         load_loop_cases(["nowhere"])
 
 
@@ -306,6 +301,6 @@ def test_the_shipped_flights_hold_together(tmp_path: Path) -> None:
 def test_no_signal_is_sent_before_the_flight_process_has_reported(tmp_path, signal):
     """Without a report its number is 0, and signals to 0 end the caller and its siblings."""
     with ExitStack() as stack:
-        companion = LoopCompanion(tmp_path / "companion.yaml", tmp_path, stack, supervised=True)
+        companion = FlightCompanion(tmp_path / "companion.yaml", tmp_path, stack, supervised=True)
         with pytest.raises(FlightError, match="no health report"):
             getattr(companion, signal)()

@@ -108,10 +108,6 @@ def test_a_huge_leaf_is_cut(make, tmp_path, build, monkeypatch):
     assert verify(cache).holes == ()
 
 
-def test_tilesets_with_levels_stay_as_they_are(source, cache):
-    assert cache.manifest.tiles == 21
-
-
 def test_weight_tells_triangles_and_texels(make, tmp_path):
     positions, uvs, faces = make.patch(0, 0, 10, 5)
     path = tmp_path / "t.glb"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import resource
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -21,6 +21,7 @@ from localizer.errors import MapCacheError, MapSourceError
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
+from localizer.map.building.staging import Staging, staging
 from localizer.map.cache.cache import TileCache, decode_tile, encode_tile
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.cache.tile import TileMesh, build_mips, texel_coverage
@@ -69,11 +70,9 @@ def test_a_pipe_in_a_cache_does_not_hang_the_loader(copy, what):
         cache.load_tile(0) if what == "tile" else TileCache.open(copy)
 
 
-def test_damaged_index_is_found(copy):
+def test_a_damaged_or_missing_index_is_found(copy):
     path = copy / "index.safetensors"
-    data = bytearray(path.read_bytes())
-    data[-5] ^= 1
-    path.write_bytes(data)
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
     with pytest.raises(MapCacheError, match="hash in the manifest"):
         TileCache.open(copy)
     path.unlink()
@@ -163,18 +162,6 @@ def test_a_tile_that_would_lead_kernels_astray_is_refused(array, value, told):
             decode_tile(data, Pose.identity(), textured=textured)
 
 
-@pytest.mark.parametrize("keep", [0, 7, 8, 50, 500])
-def test_truncated_tile_data_is_a_named_error(keep):
-    data = encode_tile(
-        np.zeros((3, 3), np.float32),
-        np.zeros((3, 2), np.float32),
-        np.array([[0, 1, 2]], np.int32),
-        (np.zeros((64, 64, 3), np.uint8),),
-    )
-    with pytest.raises(MapCacheError):
-        decode_tile(data[:keep], Pose.identity())
-
-
 def test_unused_texels_do_not_bleed_into_mips():
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, :24] = 200  # one chart on black
@@ -197,65 +184,42 @@ def test_same_input_gives_the_same_bytes(source, tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
 
 
-KILLED = """
-import os, sys
-from pathlib import Path
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
-import localizer.map.building.staging as staging
-store, count = staging.Staging.store, 0
-def store_some(self, key, meshes):
-    global count
-    count += 1
-    if count > 9:
-        os.kill(os.getpid(), 9)
-    return store(self, key, meshes)
-staging.Staging.store = store_some
-build_cache(Path(sys.argv[1]), Path(sys.argv[2]), BuildOptions(workers=1))
-"""
+def test_an_ended_build_goes_on_and_a_changed_source_begins_it_anew(make, tmp_path, monkeypatch):
+    source, out, other = make.tileset(tmp_path / "s"), tmp_path / "cache", tmp_path / "other"
+    stored: list[int] = []
+    store, ended = Staging.store, 9
 
+    def store_some(self, key, meshes):
+        if key >= ended:
+            raise KeyboardInterrupt
+        stored.append(key)
+        return store(self, key, meshes)
 
-def test_build_goes_on_after_kill(source, cache, tmp_path, monkeypatch):
-    out = tmp_path / "cache"
-    run = subprocess.run([sys.executable, "-c", KILLED, str(source), str(out)], check=False)
-    assert run.returncode == -signal.SIGKILL
+    monkeypatch.setattr(Staging, "store", store_some)
+    with pytest.raises(KeyboardInterrupt):
+        build_cache(source, out, BuildOptions(workers=1))
     assert not out.exists()
-    from localizer.map.building.staging import Staging
-
-    stored = []
-    store = Staging.store
-    monkeypatch.setattr(
-        Staging,
-        "store",
-        lambda self, key, meshes: (stored.append(key), store(self, key, meshes))[1],
-    )
+    shutil.copytree(tmp_path / "cache.building", tmp_path / "other.building")
+    ended = 99
+    stored.clear()
     manifest = build_cache(source, out, BuildOptions(workers=1))
     assert sorted(stored) == list(range(9, 21))
-    assert manifest == cache.manifest
+    assert manifest.tiles == 21
     assert not out.with_name("cache.building").exists()
-
-
-FULL = """
-import resource, signal, sys
-from pathlib import Path
-from localizer.errors import MapCacheError
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
-try:
-    build_cache(Path(sys.argv[1]), Path(sys.argv[2]), BuildOptions(workers=1))
-except MapCacheError as error:
-    sys.exit(f"named: {error}")
-"""
+    stored.clear()
+    os.utime(source.with_name("0_-200_-200.glb"), ns=(1, 1))
+    build_cache(source, other, BuildOptions(workers=1))
+    assert sorted(stored) == list(range(21))
 
 
 def test_a_full_disk_is_named_and_the_build_goes_on_after_it(source, cache, tmp_path):
-    out = tmp_path / "cache"
-    command = [sys.executable, "-c", FULL, str(source), str(out)]
-    run = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert run.stderr.startswith("named: ")
-    assert "cannot be written: File too large" in run.stderr
+    out, limits = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
+    try:
+        with pytest.raises(MapCacheError, match="cannot be written: File too large"):
+            build_cache(source, out, BuildOptions(workers=1))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not out.exists()
     assert build_cache(source, out, BuildOptions(workers=1)) == cache.manifest
 
@@ -294,19 +258,7 @@ def test_workers_end_with_a_build_that_was_killed(tmp_path):
         time.sleep(0.05)
 
 
-def test_a_changed_source_is_not_mixed_with_an_old_build(make, tmp_path):
-    source = make.tileset(tmp_path / "s")
-    out = tmp_path / "cache"
-    subprocess.run([sys.executable, "-c", KILLED, str(source), str(out)], check=False)
-    first = next((tmp_path / "s").glob("0_*.glb"))
-    os.utime(first, ns=(time.time_ns(), time.time_ns() + 10**9))
-    fresh = build_cache(source, out, BuildOptions(workers=1))
-    assert fresh.tiles == 21
-
-
 def test_two_builds_do_not_share_a_folder(source, tmp_path):
-    from localizer.map.building.staging import staging
-
     with (
         staging(tmp_path / "c", {}, overwrite=False),
         pytest.raises(MapCacheError, match="another"),
@@ -358,12 +310,11 @@ def test_a_cache_that_was_replaced_before_it_was_held_is_not_read(source, tmp_pa
         pass
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EBADF])
-def test_where_locks_are_not_known_maps_are_read_and_built(source, tmp_path, monkeypatch, number):
+def test_where_locks_are_not_known_maps_are_read_and_built(source, tmp_path, monkeypatch):
     """False alarm: a network's file system may know no locks, or none on folders."""
 
     def refuses(*_):
-        raise OSError(number, "no locks")
+        raise OSError(errno.ENOLCK, "no locks")
 
     out = tmp_path / "c"
     build_cache(source, out, BuildOptions(workers=1))

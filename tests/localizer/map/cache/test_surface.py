@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 
-from localizer.errors import MapCacheError
-from localizer.map.cache.cache import TileCache
 from localizer.map.cache.pick import cast_bundle, cast_rays
 from localizer.map.cache.surface import MapSurface
+from tests.localizer.map.conftest import leaf_meshes
 
 EYE = np.array([-40.0, 30.0, 150.0])
 
@@ -20,17 +17,10 @@ def _bundle(rng, axis, spread=0.004):
     return directions / np.linalg.norm(directions, axis=1)[:, None]
 
 
-def _finest(cache: TileCache):
-    index = cache.index
-    leaves = np.flatnonzero(index.child_count == 0)
-    tiles = [t for n in leaves for t in range(index.tile_start[n], index.tile_start[n] + 1)]
-    return [cache.load_tile(t) for t in tiles]
-
-
 @pytest.mark.parametrize("axis", [(0, 0, -1), (0.3, 0.5, -1), (1.0, 0.2, -0.7), (0, -1, -0.2)])
 def test_a_bundle_meets_what_single_rays_meet_in_the_finest_tiles(cache, axis):
     directions = _bundle(np.random.default_rng(0), axis)
-    expected = cast_rays(_finest(cache), EYE, directions)
+    expected = cast_rays(leaf_meshes(cache), EYE, directions)
     hits = MapSurface(cache).cast(EYE, directions)
     np.testing.assert_array_equal(np.isnan(hits.distances), np.isnan(expected))
     np.testing.assert_allclose(hits.distances, expected, rtol=1e-9)
@@ -61,7 +51,7 @@ def test_a_vertical_ray_on_the_border_of_tiles_meets_one_of_them(cache):
     low, high = index.box_min[leaves].min(axis=0), index.box_max[leaves].max(axis=0)
     inner = [np.unique(index.box_min[leaves][:, a].round(3)) for a in (0, 1)]
     rng, surface, missed = np.random.default_rng(4), MapSurface(cache), []
-    tiles = _finest(cache)
+    tiles = leaf_meshes(cache)
     for axis in (0, 1):
         for border in (b for b in inner[axis] if low[axis] + 1 < b < high[axis] - 1):
             along = rng.uniform(low[1 - axis] + 1, high[1 - axis] - 1, 6)
@@ -89,13 +79,3 @@ def test_memory_stays_within_the_budget(cache):
         eye = np.array([east, north, 150.0])
         assert np.isfinite(surface.cast(eye, _bundle(rng, (0, 0, -1))).distances).all()
         assert 0 < surface.resident_bytes <= 3 * one + one
-
-
-def test_a_damaged_tile_is_named(cache_path, tmp_path):
-    copy = tmp_path / "cache"
-    shutil.copytree(cache_path, copy)
-    for tile in (copy / "tiles").rglob("*.safetensors"):
-        tile.write_bytes(tile.read_bytes()[:-1])
-    surface = MapSurface(TileCache.open(copy))
-    with pytest.raises(MapCacheError, match="does not match its hash"):
-        surface.cast(EYE, np.array([[0.0, 0.0, -1.0]]))

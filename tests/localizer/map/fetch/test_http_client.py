@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
-from localizer.map.fetch.http_client import HttpClient, RequestLimits
+from localizer.map.fetch.http_client import HttpClient
 from localizer.map.fetch.terms import require_allowed
 from tests.localizer.map.fetch.loopback import serving
 
@@ -23,7 +23,7 @@ class Time:
         self.now += seconds
 
     def client(self, **manners: float) -> HttpClient:
-        return HttpClient(RequestLimits(**manners), self.sleep, lambda: self.now)
+        return HttpClient(**manners, sleep=self.sleep, clock=lambda: self.now)
 
 
 @pytest.fixture

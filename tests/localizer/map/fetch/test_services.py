@@ -18,7 +18,7 @@ from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile, plan_files
 from localizer.map.fetch.fetch import fetch, make_plan
-from localizer.map.fetch.http_client import HttpClient, RequestLimits
+from localizer.map.fetch.http_client import HttpClient
 from localizer.map.fetch.mosaic import check_piece
 from localizer.map.fetch.raster import Piece
 from tests.localizer.map.fetch.loopback import (
@@ -63,7 +63,7 @@ def source(kind: str, url: str, **more: object) -> CatalogueSource:
 
 
 def fetched(wanted: CatalogueSource, tmp_path: Path, client: HttpClient | None = None) -> Path:
-    client = client or HttpClient(RequestLimits(50.0))
+    client = client or HttpClient(50.0)
     plan = make_plan(wanted, AREA, wanted.resolution_m, client)
     fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
     return tmp_path / "out.tif"
@@ -140,7 +140,7 @@ def test_a_search_that_never_ends_is_given_up(server, tmp_path, monkeypatch):
     monkeypatch.setattr(server.catalogue, "endless", True)
     wanted = source("stac", f"{server.url}/api")
     with pytest.raises(MapFetchError, match="over 50 pages"):
-        fetched(wanted, tmp_path, HttpClient(RequestLimits(1000.0)))
+        fetched(wanted, tmp_path, HttpClient(1000.0))
 
 
 @pytest.mark.parametrize("kind", ["xyz", "tms", "wmts"])
@@ -200,7 +200,7 @@ def test_what_came_is_not_asked_for_again_and_another_plan_begins_anew(server, t
 
 def test_a_cut_off_run_leaves_whole_pieces_only(server, tmp_path):
     wanted = source("xyz", f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", parallel=1)
-    client = HttpClient(RequestLimits(50.0))
+    client = HttpClient(50.0)
     plan = make_plan(wanted, AREA, 0.5, client)
 
     def interrupt(done: int, _: int) -> None:
@@ -220,7 +220,7 @@ def test_a_server_that_fails_in_the_middle_of_a_file_is_told_and_not_taken_for_a
     server, tmp_path
 ):
     wanted = source("cog", f"{server.url}/surface.tif", role="surface")
-    client = HttpClient(RequestLimits(50.0), sleep=lambda _: None)
+    client = HttpClient(50.0, sleep=lambda _: None)
     plan = make_plan(wanted, AREA, 1.0, client)
     server.broken = [(404, {})]
     with pytest.raises(MapFetchError, match="status 404"):
@@ -240,7 +240,7 @@ def _with_sea_beside(server, wanted: CatalogueSource, lacks: int) -> list[CloudF
 def test_a_degree_of_the_worlds_model_that_is_sea_does_not_cost_the_coast(server, tmp_path, lacks):
     """Its 404 ended the fetch of every coast whose area reached a degree further."""
     wanted = source("cog", f"{server.url}/surface.tif", role="surface")
-    client = HttpClient(RequestLimits(50.0))
+    client = HttpClient(50.0)
     plan = plan_files(wanted, AREA, 1.0, _with_sea_beside(server, wanted, lacks), client)
     fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
     compare(tmp_path / "out.tif", **HEIGHTS)
@@ -250,7 +250,7 @@ def test_a_degree_of_the_worlds_model_that_is_sea_does_not_cost_the_coast(server
 def test_a_degree_without_a_file_is_unknown_and_named_and_never_a_height_of_zero(server, tmp_path):
     """GLO-30 Public lacks some land, too, and a 404 does not say which of both it is."""
     wanted = source("cog", f"{server.url}/surface.tif", role="surface")
-    client = HttpClient(RequestLimits(50.0))
+    client = HttpClient(50.0)
     west, south, east, north = wanted.bounds
     middle = 0.5 * (west + east)
     files = [
@@ -271,7 +271,7 @@ def test_a_degree_without_a_file_is_unknown_and_named_and_never_a_height_of_zero
 
 def test_where_every_degree_is_sea_it_is_told_by_name_and_a_named_file_must_be_there(server):
     wanted = source("cog", f"{server.url}/sea.tif", role="surface")
-    client = HttpClient(RequestLimits(50.0))
+    client = HttpClient(50.0)
     sea = CloudFile(wanted.url, wanted.bounds, may_lack=True)
     with pytest.raises(MapFetchError, match=r"sea\.tif.*no such file.*all sea"):
         plan_files(wanted, AREA, 1.0, [sea, sea], client)

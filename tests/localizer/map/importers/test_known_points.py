@@ -68,32 +68,21 @@ def centroids(path: Path) -> np.ndarray:
     return np.stack([x, -z, y], -1) + rtc
 
 
-@pytest.fixture(scope="module")
-def imported(real_data, tmp_path_factory):
-    """The tileset and the cache of a real data set."""
-
-    def build(name: str, tileset: str, **options) -> tuple[Path, TileCache]:
-        source = real_data(name) / tileset
-        out = tmp_path_factory.mktemp(name) / "cache"
-        build_cache(source, out, BuildOptions(workers=2, **options))
-        return source, TileCache.open(out)
-
-    return build
-
-
 @pytest.mark.real
-def test_quito_is_imported_whole_and_in_place(imported):
-    source, cache = imported("quito", "tileset.json", geoid_separation_m=25.0)
+def test_quito_is_imported_whole_and_in_place(real_data, quito_map):
+    cache = TileCache.open(quito_map)
     assert (cache.manifest.tiles, cache.manifest.skipped) == (637, {})
     low, high = cache.manifest.height_range_m
     assert (low, high) == pytest.approx((0.0, 38.06), abs=0.05)  # the data set's description
-    check_known_points(source, cache)
+    check_known_points(real_data("quito") / "tileset.json", cache)
 
 
 @pytest.mark.real
-def test_what_is_there_of_malvern_is_in_place(imported):
-    options = {"geoid_separation_m": -33.0, "skip_bad_tiles": True}
-    source, cache = imported("malvern", "b3dmtileset.json", **options)
+def test_what_is_there_of_malvern_is_in_place(real_data, tmp_path):
+    source = real_data("malvern") / "b3dmtileset.json"
+    options = BuildOptions(workers=2, geoid_separation_m=-33.0, skip_bad_tiles=True)
+    build_cache(source, tmp_path / "cache", options)
+    cache = TileCache.open(tmp_path / "cache")
     assert len(cache.manifest.skipped) == 356
     check_known_points(source, cache)
 

@@ -16,7 +16,7 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.georeference import Georeference, ecef_from_crs, read_georeference
 from localizer.map.importers.heightmesh import height_mesh
 from localizer.render.numba_raster import NumbaRenderer
-from tests.localizer.map.conftest import built
+from tests.localizer.map.conftest import built, leaf_meshes, write_obj
 
 DATUM = {"geoid_separation_m": 48.0, "vertical_datum": "ellipsoidal"}
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -28,18 +28,6 @@ def picture(size=1500):
     image = np.full((size, size, 3), 90, np.uint8)
     image[..., 2], image[..., 1] = ramp[None], ramp[:, None]
     return image
-
-
-def leaf_meshes(cache):
-    leaves = np.flatnonzero(cache.index.child_count == 0)
-    return [
-        cache.load_tile(t)
-        for n in leaves
-        for t in range(
-            int(cache.index.tile_start[n]),
-            int(cache.index.tile_start[n] + cache.index.tile_count[n]),
-        )
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +78,7 @@ def test_obj_with_odm_offsets(tmp_path, make, build):
     positions, uvs, faces = make.patch(0, 0, 60, 6)
     cv2.imwrite(str(tmp_path / "m.png"), picture(128))
     (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd m.png\n")
-    lines = ["mtllib m.mtl", "usemtl a"]
-    lines += [f"v {x} {y} {z}" for x, y, z in positions]
-    lines += [f"vt {u} {1 - v}" for u, v in uvs]
-    lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces]
-    (tmp_path / "m.obj").write_text("\n".join(lines))
+    write_obj(tmp_path, positions, uvs, faces)
     offset = tmp_path / "coords.txt"
     offset.write_text("WGS84 UTM 32N\n500100 5228300\n")
     cache = build(tmp_path / "m.obj", georeference=offset, **DATUM)
@@ -114,7 +98,8 @@ def test_georeference_files(tmp_path):
     assert read_georeference(path).origin == Geodetic(30.1, -98.0, 373.8)
     path.write_text('{"epsg": 32614, "offset": [1, 2, 3]}')
     assert read_georeference(path).offset == (1.0, 2.0, 3.0)
-    for bad in ("", "{}", '{"epsg": 4326, "offset": [1, 2, 3]}', "WGS84 UTM 99N\n1 2", "{", "\0"):
+    degrees, feet = (f'{{"epsg": {epsg}, "offset": [985000, 210000, 0]}}' for epsg in (4326, 2263))
+    for bad in ("", "{}", degrees, feet, "WGS84 UTM 99N\n1 2", "{", "\0"):
         path.write_text(bad)
         with pytest.raises(GeoreferenceError, match="not a georeference"):
             read_georeference(path)

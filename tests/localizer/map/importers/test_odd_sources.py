@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-import http.server
 import json
 import os
 import re
-import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,13 +26,14 @@ from localizer.geometry.geoid import geoid_separation
 from localizer.map.building.build import build_cache
 from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
-from localizer.map.cache.cache import TileCache
 from localizer.map.importers.georeference import Georeference, read_georeference
 from localizer.map.importers.raster_checks import check_heights
 from localizer.map.importers.raster_file import METRES, offline, open_raster, require_sane
-from localizer.map.importers.rules import ImportRules
+from localizer.map.importers.rules import ImportRules, require_plain_file
+from localizer.map.importers.tiles3d import read_tileset
 from tests.localizer.map.conftest import ORIGIN as TILESET_ORIGIN
-from tests.localizer.map.conftest import PLACE, write_raster, write_tree
+from tests.localizer.map.conftest import PLACE, leaf_meshes, write_raster, write_tree
+from tests.localizer.map.fetch.loopback import serving
 
 UTM = "EPSG:32632"
 (LEFT, TOP), STEP, CELLS = PLACE, 1.0, 48
@@ -290,7 +290,6 @@ CASES = [
     Refused(sparse, r"more than 20,000,000,000 pixels .*--limit pixels=160000000000"),
     raster("no_place", "no geotransform", transform=Affine.identity()),
     raster("singular", "singular", transform=Affine(1, 0, LEFT, 1, 0, TOP)),
-    raster("no_crs", "no CRS", crs=None),
     # Latitude where longitude belongs: rows beyond the pole.
     raster("degrees_swapped", "dsm.tif: its corners .* lie outside .* swapped",
            both=DEGREES | {"place": (47.2, 189.0)}),
@@ -358,51 +357,39 @@ def test_an_odd_source_is_refused_by_name_or_trusted(case, tmp_path, make):
 # --- odd, and handled right -----------------------------------------------------------------------
 
 
-@pytest.fixture
-def built(tmp_path):
-    def run(source, **options):
-        options = {"workers": 1} | options
-        build_cache(source, tmp_path / "c", BuildOptions(**options))
-        return TileCache.open(tmp_path / "c")
-
-    return run
-
-
 def heights_of(cache):
     """(lowest, highest) height of the finest surface without its skirts: above the ellipsoid."""
-    index = cache.index
     found = []
-    for node in np.flatnonzero((index.child_count == 0) & (index.tile_count > 0)):
-        mesh = cache.load_tile(int(index.tile_start[node]))
+    for mesh in leaf_meshes(cache):
         up = np.unique(mesh.faces[mesh.faces[:, 0] < len(mesh.positions)])
         points = mesh.world_from_tile.apply(mesh.positions[up])
         found.append(cache.frame.geodetic_from_enu(points)[:, 2])
     return np.concatenate(found).min(), np.concatenate(found).max()
 
 
-def test_outside_a_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
+def test_outside_a_dsm_without_a_nodata_tag_is_no_ground(tmp_path, build):
     narrow = ground(90, 40)  # 40 rows of 90: most of the square about it is outside
-    cache = built(rasters(tmp_path, narrow, ortho={"data": picture(96)}), **ELLIPSOIDAL)
+    cache = build(rasters(tmp_path, narrow, ortho={"data": picture(96)}), **ELLIPSOIDAL)
     low, high = heights_of(cache)
     assert 385 < low < high < 406  # with the coarse levels' skirts; it was -2
     box = cache.index.box_max[0] - cache.index.box_min[0]
     assert box[:2] == pytest.approx([89, 39], abs=1.5)
 
 
-def test_beside_a_turned_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
+def test_beside_a_turned_dsm_without_a_nodata_tag_is_no_ground(tmp_path, build):
     """Three vertices at its corners were 400 m below the ground."""
     turned = Affine.translation(LEFT, TOP) @ Affine.rotation(10) @ Affine.scale(1, -1)
     source = [
         write_raster(tmp_path / "dsm.tif", ground(80), transform=turned),
         write_raster(tmp_path / "ortho.tif", picture(80), transform=turned),
     ]
-    low, high = heights_of(built(source, **ELLIPSOIDAL))
+    low, high = heights_of(build(source, **ELLIPSOIDAL))
     assert 394 < low < high < 406
 
 
-def test_ground_that_is_flat_to_the_last_digit_keeps_its_rim(tmp_path, built):
+def test_ground_that_is_flat_to_the_last_digit_keeps_its_rim(tmp_path, build):
     """A lake, or flat test ground: 29 x 40 of 47 x 47 m were left."""
-    cache = built(rasters(tmp_path, np.full((CELLS, CELLS), 400, np.float32)), **ELLIPSOIDAL)
+    cache = build(rasters(tmp_path, np.full((CELLS, CELLS), 400, np.float32)), **ELLIPSOIDAL)
     box = cache.index.box_max[0] - cache.index.box_min[0]
     assert box[:2] == pytest.approx([47, 47], abs=0.1)
 
@@ -434,8 +421,8 @@ def test_a_georeference_says_each_thing_once_and_what_is_not_read_is_told(tmp_pa
     assert read_georeference(path).unread == ("scale",)
 
 
-def test_outside_the_orthophoto_is_no_map(tmp_path, built):
-    cache = built(rasters(tmp_path, ortho={"data": picture(30)}), **ELLIPSOIDAL)
+def test_outside_the_orthophoto_is_no_map(tmp_path, build):
+    cache = build(rasters(tmp_path, ortho={"data": picture(30)}), **ELLIPSOIDAL)
     box = cache.index.box_max[0] - cache.index.box_min[0]
     assert box[:2] == pytest.approx([30, 30], abs=1.5)
     cache.manifest.model_dump_json()
@@ -478,25 +465,18 @@ def test_a_tower_a_tree_and_a_gorge_are_no_spikes(tmp_path):
         assert check_heights(Path("dsm.tif"), dsm, METRES, ImportRules()) == []
 
 
-def test_a_spike_is_in_the_maps_warnings(tmp_path, built):
-    data = ground()
-    data[20, 20] = 3500.0
-    cache = built(rasters(tmp_path, data), **ELLIPSOIDAL)
-    assert [text for text in cache.manifest.warnings if "all that is about it" in text]
-
-
 @pytest.mark.parametrize("level", [0, 200])
-def test_an_orthophoto_of_one_colour_is_told(tmp_path, built, level):
+def test_an_orthophoto_of_one_colour_is_told(tmp_path, build, level):
     blank = np.full((3, CELLS, CELLS), level, np.uint8)
     blank[:, 3, 3] += 1  # a lossy file's noise
-    cache = built(rasters(tmp_path, ortho={"data": blank}), **ELLIPSOIDAL)
+    cache = build(rasters(tmp_path, ortho={"data": blank}), **ELLIPSOIDAL)
     (told,) = cache.manifest.warnings
     assert f"ortho.tif: shows one colour ({level}, {level}, {level}) all over" in told
 
 
-def test_a_dark_orthophoto_that_shows_something_is_not_doubted(tmp_path, built):
+def test_a_dark_orthophoto_that_shows_something_is_not_doubted(tmp_path, build):
     dark = picture() // 40
-    assert built(rasters(tmp_path, ortho={"data": dark}), **ELLIPSOIDAL).manifest.warnings == ()
+    assert build(rasters(tmp_path, ortho={"data": dark}), **ELLIPSOIDAL).manifest.warnings == ()
 
 
 @pytest.mark.parametrize("given", [float("nan"), float("inf"), -4000.0])
@@ -507,48 +487,48 @@ def test_a_geoid_separation_that_is_none_is_refused(tmp_path, given):
     assert not (tmp_path / "c").exists()
 
 
-def test_what_a_mask_hides_is_no_map(tmp_path, built):
+def test_what_a_mask_hides_is_no_map(tmp_path, build):
     paths = rasters(tmp_path)
     shown = np.full((CELLS, CELLS), 255, np.uint8)
     shown[:, 20:] = 0
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(paths[1], "r+") as data:
         data.write_mask(shown)
-    box = np.ptp([*zip(*built(paths, **ELLIPSOIDAL).manifest.extent, strict=True)], axis=1)
+    box = np.ptp([*zip(*build(paths, **ELLIPSOIDAL).manifest.extent, strict=True)], axis=1)
     assert box[1] * 75_600 == pytest.approx(20, abs=1.5)  # metres of longitude there
 
 
 @pytest.mark.parametrize(
     ("value", "dtype"), [(-9999, np.float32), (-32768, np.int16), (0, np.float32)]
 )
-def test_nodata_that_is_told_is_left_out(tmp_path, built, value, dtype):
-    cache = built(rasters(tmp_path, with_hole(value, dtype)), nodata=value, **ELLIPSOIDAL)
+def test_nodata_that_is_told_is_left_out(tmp_path, build, value, dtype):
+    cache = build(rasters(tmp_path, with_hole(value, dtype)), nodata=value, **ELLIPSOIDAL)
     low, high = heights_of(cache)
     assert 385 < low < high < 406
 
 
 @pytest.mark.parametrize("where", ["crs", "tag", "option", "scale"])
-def test_feet_become_metres(tmp_path, built, where):
+def test_feet_become_metres(tmp_path, build, where):
     feet = ground() / 0.3048
     if where == "crs":
         paths = rasters(tmp_path, feet, crs=f"{UTM}+8228")  # NAVD88 height (ft)
-        low, high = heights_of(built(paths))
+        low, high = heights_of(build(paths))
         lift = geoid_separation(47.2, 9.0)
     else:
         tags = {"tag": {"units": ["ft"]}, "option": {}, "scale": {"scales": [0.3048]}}[where]
         options = ELLIPSOIDAL | ({"height_unit": "ft"} if where == "option" else {})
-        low, high = heights_of(built(rasters(tmp_path, feet, **tags), **options))
+        low, high = heights_of(build(rasters(tmp_path, feet, **tags), **options))
         lift = 0.0
     assert 390 < low - lift < high - lift < 406
 
 
-def test_a_dsm_in_feet_stands_where_it_says(tmp_path, built):
+def test_a_dsm_in_feet_stands_where_it_says(tmp_path, build):
     """Horizontal and vertical US survey feet: New York, 400 ft high, 48 ft wide."""
     crs = "EPSG:2263+6360"
     place = (985_000.0, 210_000.0)
     paths = rasters(
         tmp_path, crs=crs, place=place, ortho={"crs": "EPSG:2263", "place": place}
     )  # fmt: skip
-    cache = built(paths)
+    cache = build(paths)
     lon, lat = Transformer.from_crs("EPSG:2263", "EPSG:4326", always_xy=True).transform(
         place[0] + 24, place[1] - 24
     )
@@ -562,26 +542,26 @@ def test_a_dsm_in_feet_stands_where_it_says(tmp_path, built):
     assert any("NAVD88" in text for text in cache.manifest.warnings)
 
 
-def test_a_compound_crs_says_what_heights_are_above(tmp_path, built):
+def test_a_compound_crs_says_what_heights_are_above(tmp_path, build):
     paths = rasters(tmp_path, crs=f"{UTM}+3855")  # EGM2008
     with pytest.raises(GeoreferenceError, match=r"amsl by its CRS \(EGM2008 height\).*datum"):
-        built(paths, **ELLIPSOIDAL)
-    cache = built(paths)
+        build(paths, **ELLIPSOIDAL)
+    cache = build(paths)
     assert cache.manifest.vertical_datum == "amsl"
     assert any("lifted by EGM96" in text for text in cache.manifest.warnings)
     assert heights_of(cache)[1] == pytest.approx(405 + geoid_separation(47.2, 9.0), abs=0.1)
 
 
-def test_a_three_dimensional_crs_is_ellipsoidal(tmp_path, built):
+def test_a_three_dimensional_crs_is_ellipsoidal(tmp_path, build):
     paths = rasters(tmp_path, crs=CRS(UTM).to_3d().to_wkt())
     with pytest.raises(GeoreferenceError, match="ellipsoidal by its CRS"):
-        built(paths, vertical_datum="amsl")
-    assert built(paths).manifest.vertical_datum == "ellipsoidal"
+        build(paths, vertical_datum="amsl")
+    assert build(paths).manifest.vertical_datum == "ellipsoidal"
 
 
 @pytest.mark.parametrize("flip", ["rows", "columns"])
-def test_rasters_that_run_the_other_way_lie_the_same(tmp_path, built, flip):
-    honest = built(rasters(tmp_path), **ELLIPSOIDAL)
+def test_rasters_that_run_the_other_way_lie_the_same(tmp_path, build, flip):
+    honest = build(rasters(tmp_path), **ELLIPSOIDAL)
     seen = honest.load_tile(0).mips[0]
     if flip == "rows":
         options = {"transform": Affine(STEP, 0, LEFT, 0, STEP, TOP - CELLS * STEP)}
@@ -590,18 +570,18 @@ def test_rasters_that_run_the_other_way_lie_the_same(tmp_path, built, flip):
         options = {"transform": Affine(-STEP, 0, LEFT + CELLS * STEP, 0, -STEP, TOP)}
         turn = (..., slice(None, None, -1))
     paths = rasters(tmp_path, ground()[turn], ortho={"data": picture()[turn]} | options, **options)
-    other = built(paths, overwrite=True, **ELLIPSOIDAL)
+    other = build(paths, overwrite=True, **ELLIPSOIDAL)
     assert np.allclose(other.index.box_min[0], honest.index.box_min[0], atol=0.01)
     assert np.allclose(other.index.box_max[0], honest.index.box_max[0], atol=0.01)
     difference = np.abs(other.load_tile(0).mips[0].astype(int) - seen)
     assert difference.mean() < 2  # a mirrored picture's is 40
 
 
-def test_colours_in_another_order_are_put_right(tmp_path, built):
-    honest = built(rasters(tmp_path), **ELLIPSOIDAL).load_tile(0).mips[0]
+def test_colours_in_another_order_are_put_right(tmp_path, build):
+    honest = build(rasters(tmp_path), **ELLIPSOIDAL).load_tile(0).mips[0]
     order = [ColorInterp.blue, ColorInterp.green, ColorInterp.red]
     swapped = {"data": picture()[::-1], "colorinterp": order, "photometric": "minisblack"}
-    other = built(rasters(tmp_path, ortho=swapped), overwrite=True, **ELLIPSOIDAL)
+    other = build(rasters(tmp_path, ortho=swapped), overwrite=True, **ELLIPSOIDAL)
     assert np.array_equal(other.load_tile(0).mips[0], honest)
 
 
@@ -619,33 +599,18 @@ def test_only_control_points_are_no_place(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # as it should be
 def test_no_name_makes_gdal_fetch_anything(tmp_path):
-    asked = []
-
-    class Listening(http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            asked.append(self.path)
-            self.send_error(404)
-
-        def do_HEAD(self):
-            self.do_GET()
-
-        def log_message(self, *_):
-            pass
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Listening)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    address = f"http://127.0.0.1:{server.server_port}/x.tif"
-    vrt = (
-        '<VRTDataset rasterXSize="48" rasterYSize="48"><VRTRasterBand dataType="Float32" band="1">'
-        f"<SimpleSource><SourceFilename>/vsicurl/{address}</SourceFilename><SourceBand>1"
-        "</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
-    )
-    try:
+    with serving(tmp_path) as server:
+        address = f"/vsicurl/{server.url}/x.tif"
+        vrt = (
+            '<VRTDataset rasterXSize="48" rasterYSize="48"><VRTRasterBand dataType="Float32" '
+            f'band="1"><SimpleSource><SourceFilename>{address}</SourceFilename><SourceBand>1'
+            "</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
+        )
         (tmp_path / "v.vrt").write_text(vrt)
         with pytest.raises(rasterio.errors.RasterioError), rasterio.open(tmp_path / "v.vrt") as v:
             v.read(1)
-        assert asked  # what GDAL does when it is let
-        asked.clear()
+        assert server.asked  # what GDAL does when it is let
+        server.asked.clear()
         for name in ("dsm.tif", "dsm.tif.ovr", "dsm.tif.msk"):
             paths = rasters(tmp_path)
             (tmp_path / name).write_text(vrt)
@@ -653,44 +618,32 @@ def test_no_name_makes_gdal_fetch_anything(tmp_path):
                 build_cache(paths, tmp_path / "c", BuildOptions(workers=1, **ELLIPSOIDAL))
             (tmp_path / name).unlink()
         with offline(), pytest.raises(rasterio.errors.RasterioError):
-            rasterio.open(f"/vsicurl/{address}")
-    finally:
-        server.shutdown()
-        server.server_close()
-    assert not asked
+            rasterio.open(address)
+        assert not server.asked
 
 
 # --- processes with limits ---------------------------------------------------------------
 
 
-def eat_memory():
-    return len(np.ones(2**31, np.uint8))
-
-
-def crash():
-    os.abort()
-
-
-def hang():
-    threading.Event().wait()
-
-
-def fail():
-    raise MapSourceError("as it said")
-
-
 @pytest.mark.parametrize(
     ("what", "limits", "says"),
     [
-        (eat_memory, {"memory_mb": 300}, "does not fit into memory"),
-        (crash, {}, "it crashed .SIGABRT.*|its part crashed"),
-        (hang, {"seconds": 4}, "longer than 4 s"),
-        (fail, {}, "^as it said$"),
+        ((bytearray, 2**31), {"memory_mb": 300}, "does not fit into memory"),
+        ((os.abort,), {}, "its part crashed .SIGABRT"),
+        ((time.sleep, 600.0), {"seconds": 1}, "longer than 1 s"),
+        ((require_plain_file, Path("none")), {}, "^none cannot be read"),
     ],
 )
 def test_what_a_process_does_is_a_named_error_here(what, limits, says):
     with pytest.raises(MapSourceError, match=says):
-        call_in_process(what, rules=ImportRules(**limits), what="its part")
+        call_in_process(*what, rules=ImportRules(**limits), what="its part")
+
+
+def test_a_deep_tree_comes_back_from_its_process(tmp_path, make):
+    rules = ImportRules(depth=300)
+    source = deep_tileset(tmp_path, make)
+    tree = call_in_process(read_tileset, source, rules, rules=rules, what="its part")
+    assert sum(1 for _ in tree.root.walk()) == 252
 
 
 def test_limits_and_doubts_are_named():
@@ -701,18 +654,3 @@ def test_limits_and_doubts_are_named():
             ImportRules.of([text])
     with pytest.raises(MapSourceError, match="no such doubt; there are area, datum"):
         ImportRules.of(trusted=["everything"])
-
-
-def test_a_honest_source_is_read_apart_without_a_warning(source, cache, tmp_path):
-    manifest = build_cache(source, tmp_path / "c", BuildOptions(workers=1, apart=True))
-    assert manifest == cache.manifest
-    assert manifest.warnings == ()
-
-
-def test_a_mesh_in_feet_is_refused(tmp_path):
-    path = tmp_path / "georef.json"
-    path.write_text(json.dumps({"epsg": 2263, "offset": [985000, 210000, 0]}))
-    with pytest.raises(GeoreferenceError, match="in feet"):
-        build_cache(
-            obj(tmp_path), tmp_path / "c", BuildOptions(georeference=path, workers=1, **ELLIPSOIDAL)
-        )

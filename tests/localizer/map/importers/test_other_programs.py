@@ -21,10 +21,16 @@ from localizer.map.importers.georeference import Georeference
 from localizer.map.importers.gltf import read_gltf
 from localizer.map.importers.height_crs import geo_keys, stated_heights
 from localizer.map.importers.raster_file import offline, open_raster
-from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import read_tileset
-from tests.localizer.map.conftest import ORIGIN, write_raster, write_tree
+from tests.localizer.map.conftest import (
+    ORIGIN,
+    built,
+    leaf_meshes,
+    write_obj,
+    write_raster,
+    write_tree,
+)
 
 BOX = [0, 0, 5, 60, 0, 0, 0, 60, 0, 0, 0, 20]
 COUNTRY = [*np.radians([5.9, 45.8, 10.5, 47.8]), 200.0, 4700.0]
@@ -79,12 +85,6 @@ def test_compressed_content_is_unpacked_and_what_is_not_is_named(tmp_path, make,
         other = tileset(tmp_path / "other", data)
         with pytest.raises(MapSourceError, match=said):
             read_tileset(other).root.tiles[0].load()
-
-
-def test_what_compressed_content_refers_to_belongs_to_the_source(tmp_path):
-    document = {"images": [{"uri": "roof.jpg"}]}
-    (tmp_path / "m.gltf").write_bytes(gzip.compress(json.dumps(document).encode()))
-    assert [p.name for p in files_beside(tmp_path / "m.gltf")] == ["roof.jpg"]
 
 
 @pytest.mark.parametrize(
@@ -170,10 +170,9 @@ def test_ground_on_its_edge_is_refused_with_the_option_that_turns_it(tmp_path, c
 
 def test_a_mesh_and_ground_that_faces_down_are_found_alike(tmp_path, make, content):
     (tmp_path / "m.glb").write_bytes(content(up="z"))
-    place = {"georeference": Georeference(origin=ORIGIN), "vertical_datum": "ellipsoidal"}
     with pytest.raises(MapSourceError, match="try --up-axis z"):
-        build_cache(tmp_path / "m.glb", tmp_path / "c", BuildOptions(workers=1, **place))
-    build_cache(tmp_path / "m.glb", tmp_path / "c", BuildOptions(workers=1, up_axis="z", **place))
+        built(tmp_path / "m.glb", tmp_path / "c", **PLACE)
+    built(tmp_path / "m.glb", tmp_path / "c", up_axis="z", **PLACE)
     positions, uvs, faces = make.patch(-60, -60, 120, 12)
     down = make.glb(make.y_up(positions * (1, -1, -1)), uvs, faces, make.picture(3))
     source = tileset(tmp_path / "s", down)
@@ -354,21 +353,15 @@ def obj(folder, make, library, lines=("mtllib m.mtl", "usemtl a"), image="tex.jp
     (folder / image).parent.mkdir(exist_ok=True)
     (folder / image).write_bytes(make.picture(2))
     (folder / "m.mtl").write_text(library)
-    text = [f"v {x} {y} {z}" for x, y, z in positions] + [f"vt {u} {1 - v}" for u, v in uvs]
-    text += [line for line in lines if line.startswith("usemtl")]
-    text += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces]
-    heads = [line for line in lines if not line.startswith("usemtl")]
-    (folder / "m.obj").write_text("\n".join([*heads, *text]))
-    return folder / "m.obj"
+    return write_obj(folder, positions, uvs, faces, lines)
 
 
-def built(path, out):
-    place = {"georeference": Georeference(origin=ORIGIN), "vertical_datum": "ellipsoidal"}
-    manifest = build_cache(path, out, BuildOptions(workers=1, **place))
-    cache = TileCache.open(out)
-    index = cache.index
-    leaf = int(np.flatnonzero((index.child_count == 0) & (index.tile_count > 0))[0])
-    return manifest, cache.load_tile(int(index.tile_start[leaf]))
+PLACE = {"georeference": Georeference(origin=ORIGIN), "vertical_datum": "ellipsoidal"}
+
+
+def built_tile(path, out):
+    cache = built(path, out, **PLACE)
+    return cache.manifest, leaf_meshes(cache)[0]
 
 
 @pytest.mark.parametrize(
@@ -388,14 +381,14 @@ def built(path, out):
 )
 def test_the_picture_of_a_material_is_found(tmp_path, make, statement, image):
     source = obj(tmp_path, make, f"newmtl a\nKd 1 1 1\n{statement}\n", image=image)
-    manifest, tile = built(source, tmp_path / "c")
+    manifest, tile = built_tile(source, tmp_path / "c")
     assert not manifest.warnings
     assert tile.mips[0].std() > 20
 
 
 def test_a_scale_and_an_offset_of_a_picture_are_applied(tmp_path, make):
     source = obj(tmp_path, make, "newmtl a\nmap_Kd -s 0.5 0.5 -o 0.25 0.25 tex.jpg\n")
-    _, tile = built(source, tmp_path / "c")
+    _, tile = built_tile(source, tmp_path / "c")
     plain = cv2.cvtColor(cv2.imread(str(tmp_path / "tex.jpg")), cv2.COLOR_BGR2RGB)
     corner = np.argmin(tile.positions[:, 0] - tile.positions[:, 1])  # north-west
     h, w = tile.mips[0].shape[:2]
@@ -419,7 +412,7 @@ def test_a_scale_and_an_offset_of_a_picture_are_applied(tmp_path, make):
     ],
 )  # fmt: skip
 def test_an_obj_without_a_picture_is_told(tmp_path, make, library, lines, colour, told):
-    manifest, tile = built(obj(tmp_path, make, library, lines), tmp_path / "c")
+    manifest, tile = built_tile(obj(tmp_path, make, library, lines), tmp_path / "c")
     assert told in " ".join(manifest.warnings)
     if colour is not None:
         assert np.unique(tile.mips[0].reshape(-1, 3), axis=0).tolist() == [list(colour)]
@@ -429,7 +422,7 @@ def test_faces_that_name_no_material_have_the_only_one(tmp_path, make):
     source = obj(tmp_path, make, "newmtl a\nmap_Kd tex.jpg\n", ("mtllib M.MTL",))
     library = tmp_path / "m.mtl"
     library.write_bytes(library.read_text().encode("utf-16"))  # as PowerShell writes it
-    manifest, tile = built(source, tmp_path / "c")
+    manifest, tile = built_tile(source, tmp_path / "c")
     assert not manifest.warnings
     assert tile.mips[0].std() > 20
 
@@ -439,7 +432,7 @@ def test_a_mask_of_opacity_cuts_its_holes(tmp_path, make):
     mask[:32] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     source = obj(tmp_path, make, "newmtl a\nmap_Kd tex.jpg\nmap_d mask.png\n")
-    _, tile = built(source, tmp_path / "c")
+    _, tile = built_tile(source, tmp_path / "c")
     assert np.ptp(tile.positions[:, 1]) == pytest.approx(30, abs=1.5)
 
 

@@ -2,44 +2,32 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import shlex
-import struct
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
 from rasterio.enums import Resampling
-from rasterio.transform import from_origin
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import Geodetic
-from localizer.map.building.build import build_cache, fingerprint
-from localizer.map.building.options import BuildOptions
-from localizer.map.building.staging import Staging
+from localizer.map.building.build import fingerprint
+from localizer.map.building.sources import read_source
 from localizer.map.importers.folder import FoundSource, source_in
 from localizer.map.importers.georeference import Georeference
 from localizer.map.importers.raster import read_rasters
 from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.tiles3d import read_tileset
+from tests.localizer.map.conftest import b3dm, pack_glb, write_raster
 
 ORIGIN = Geodetic(47.0, 8.0, 400.0)
-DATUM = {"geoid_separation_m": 48.0, "vertical_datum": "ellipsoidal"}
 
 
 def names(path):
     return {p.name for p in files_beside(path)}
-
-
-def packed(document, b3dm=False):
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    data = b"glTF" + struct.pack("<III4s", 2, 20 + len(text), len(text), b"JSON") + text
-    if b3dm:
-        data = b"b3dm" + struct.pack("<6I", 1, 36 + len(data), 4, 0, 4, 0) + b"{}  {}  " + data
-    return data
 
 
 DOCUMENT = {
@@ -52,8 +40,9 @@ DOCUMENT = {
     ("name", "data"),
     [
         ("m.gltf", json.dumps(DOCUMENT).encode()),
-        ("m.glb", packed(DOCUMENT)),
-        ("m.b3dm", packed(DOCUMENT, b3dm=True)),
+        ("m.gltf", gzip.compress(json.dumps(DOCUMENT).encode())),
+        ("m.glb", pack_glb(DOCUMENT, b"")),
+        ("m.b3dm", b3dm(pack_glb(DOCUMENT, b""), [1.0, 2.0, 3.0])),
     ],
 )
 def test_buffers_and_pictures_of_a_gltf(tmp_path, name, data):
@@ -70,8 +59,12 @@ def test_libraries_and_pictures_of_an_obj(tmp_path):
     assert {"two words.mtl", "other.mtl", "roof.png", "b.png", "my wall.jpg"} <= found
 
 
-@pytest.mark.parametrize("data", [b"", b"glTF", b"b3dm\1", b"{", b"[]", b'{"images": 3}',
-                                  packed({"buffers": [7, {"uri": 5}]}), b"mtllib \n"])  # fmt: skip
+ODD = pack_glb({"buffers": [7, {"uri": 5}]}, b"")
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"glTF", b"b3dm\1", b"{", b"[]", b'{"images": 3}', ODD, b"mtllib \n"]
+)
 @pytest.mark.parametrize("name", ["m.gltf", "m.glb", "m.obj", "m.b3dm"])
 def test_nothing_raises(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
@@ -79,46 +72,11 @@ def test_nothing_raises(tmp_path, name, data):
     assert files_beside(tmp_path / "none.obj") == ()
 
 
-def write_obj(folder, grey):
-    cv2.imwrite(str(folder / "t.png"), np.full((64, 64, 3), grey, np.uint8))
-    (folder / "m.mtl").write_text("newmtl t\nmap_Kd t.png\n")
-    n = 40
-    lines = ["mtllib m.mtl", "usemtl t"]
-    lines += [f"v {8 * i} {8 * j} 0" for j in range(n) for i in range(n)]
-    lines += [f"vt {i / (n - 1)} {j / (n - 1)}" for j in range(n) for i in range(n)]
-    for j in range(n - 1):
-        for i in range(n - 1):
-            a = j * n + i + 1
-            for b, c in ((a + 1, a + n + 1), (a + n + 1, a + n)):
-                lines.append(f"f {a}/{a} {b}/{b} {c}/{c}")
-    (folder / "m.obj").write_text("\n".join(lines))
-    return folder / "m.obj"
-
-
-def test_a_texture_that_changes_while_a_build_rests_begins_it_anew(tmp_path, monkeypatch):
-    obj = write_obj(tmp_path, 50)
-    store, left = Staging.store, [2]
-
-    def interrupted(self, key, meshes):
-        left[0] -= 1
-        if left[0] < 0:
-            raise KeyboardInterrupt
-        return store(self, key, meshes)
-
-    options = {"georeference": Georeference(origin=ORIGIN), "workers": 1}
-    options |= DATUM
-    monkeypatch.setattr(Staging, "store", interrupted)
-    monkeypatch.setattr("localizer.map.building.quadtree.LEAF_TRIANGLES", 400)
-    with pytest.raises(KeyboardInterrupt):
-        build_cache(obj, tmp_path / "out", BuildOptions(**options))
-    cv2.imwrite(str(tmp_path / "t.png"), np.full((64, 64, 3), 200, np.uint8))
-    stored = []
-    monkeypatch.setattr(
-        Staging, "store", lambda self, key, m: (stored.append(key), store(self, key, m))[1]
-    )
-    manifest = build_cache(obj, tmp_path / "out", BuildOptions(**options))
-    assert 0 in stored
-    assert len(stored) == manifest.tiles
+def test_the_library_and_the_picture_of_a_mesh_belong_to_its_source(tmp_path):
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    (tmp_path / "m.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 9 0 0\nv 0 9 0\nusemtl a\nf 1 2 3\n")
+    tree = read_source([tmp_path / "m.obj"], Georeference(origin=ORIGIN))
+    assert {path.name for path in tree.files} == {"m.obj", "m.mtl", "t.png"}
 
 
 def test_what_a_tiles_content_refers_to(tmp_path):
@@ -134,15 +92,10 @@ def test_what_a_tiles_content_refers_to(tmp_path):
 
 @pytest.mark.parametrize("change", ["overview", "statistics", "mask"])
 def test_what_lies_beside_a_raster(tmp_path, change):
-    paths = []
-    for name, dtype, count in (("dsm", "float32", 1), ("ortho", "uint8", 3)):
-        path = tmp_path / f"{name}.tif"
-        with rasterio.open(
-            path, "w", driver="GTiff", width=64, height=64, count=count, dtype=dtype,
-            crs="EPSG:32632", transform=from_origin(5e5, 5.2e6, 1, 1),
-        ) as out:  # fmt: skip
-            out.write(np.ones((count, 64, 64), dtype))
-        paths.append(path)
+    paths = [
+        write_raster(tmp_path / "dsm.tif", np.ones((64, 64), np.float32)),
+        write_raster(tmp_path / "ortho.tif", np.ones((3, 64, 64), np.uint8)),
+    ]
     before = read_rasters(paths).files
     assert set(before) == set(paths)
     if change == "overview":

@@ -1,6 +1,5 @@
 """A map is examined before it is flown over: each fault is found, and a sound map has none."""
 
-import json
 import math
 import re
 import shutil
@@ -12,7 +11,6 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from localizer.errors import MapSourceError
-from localizer.geometry.geo import LocalFrame
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
@@ -21,7 +19,7 @@ from localizer.map.inspection.alignment import measure_alignment
 from localizer.map.inspection.check import Grade, MapUse, check_map, find_seams
 from localizer.map.inspection.mosaic import Mosaic, render_mosaic
 from localizer.map.inspection.usable import usable_part
-from tests.localizer.map.conftest import write_tileset
+from tests.localizer.map.conftest import write_tileset, write_tree
 
 FINE = MapUse(120.0, 0.004)
 COLOURS = ((170, 60, 40), (120, 120, 130), (60, 110, 50), (190, 170, 120))
@@ -156,21 +154,8 @@ def built_from(folder, make, *, up="y", trusted=(), image=None, materials=None):
     extra = {} if materials is None else {"materials": materials}
     folder.mkdir()
     (folder / "t.glb").write_bytes(make.glb(turned, uvs, faces, image or make.picture(3), **extra))
-    source = folder / "tileset.json"
-    source.write_text(
-        json.dumps(
-            {
-                "asset": {"version": "1.0"},
-                "geometricError": 10,
-                "root": {
-                    "boundingVolume": {"sphere": [0, 0, 0, 200]},
-                    "geometricError": 0,
-                    "content": {"uri": "t.glb"},
-                    "transform": LocalFrame(make.origin).ecef_from_enu.matrix.T.ravel().tolist(),
-                },
-            }
-        )
-    )
+    root = {"boundingVolume": {"sphere": [0, 0, 0, 200]}, "content": {"uri": "t.glb"}}
+    source = write_tree(folder, root)
     rules = ImportRules(trusted=frozenset(trusted))
     build.build_cache(source, folder / "c", BuildOptions(workers=1, rules=rules))
     found = check_map(TileCache.open(folder / "c"), FINE)

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import MANIFEST_NAME, TileCache
 from localizer.map.inspection.kind import map_kind
 from localizer.map.kind import MapKind
-from tests.localizer.map.conftest import write_raster
+from tests.localizer.map.conftest import built, cut_out, write_raster
 
 STEP_M, TEXEL_M, SIDE_M = 1.0, 0.25, 200.0
 
@@ -49,14 +47,12 @@ def houses(heights: np.ndarray) -> np.ndarray:
     return built
 
 
-def built(folder, surface, blur_px=0.0, tags=(), **options) -> TileCache:
+def map_of(folder, surface, blur_px=0.0, tags=(), **options) -> TileCache:
     sources = (
         write_raster(folder / "dsm.tif", surface.astype(np.float32)),
         write_raster(folder / "ortho.tif", natural(blur_px), step=TEXEL_M, tags=dict(tags)),
     )
-    how = BuildOptions(workers=1, vertical_datum="ellipsoidal", **options)
-    build_cache(sources, folder / "cache", how)
-    return TileCache.open(folder / "cache")
+    return built(sources, folder / "cache", vertical_datum="ellipsoidal", **options)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +61,7 @@ def built(folder, surface, blur_px=0.0, tags=(), **options) -> TileCache:
     ids=["houses", "hills", "plane"],
 )
 def test_buildings_are_told_from_slopes_and_slopes_from_a_plane(tmp_path, heights, expected):
-    kind = built(tmp_path, heights).manifest.kind
+    kind = map_of(tmp_path, heights).manifest.kind
     assert kind.heights == expected
     assert kind.has_buildings == (expected == "surface")
     assert (kind.unknown_height_sigma_m < 1.0) == (expected == "surface")
@@ -76,18 +72,18 @@ def test_blurred_imagery_resolves_what_its_blur_leaves(tmp_path):
     for name, blur_px, expected_m in (("sharp", 0.0, 0.25), ("soft", 2.0, 0.25 * 2.0 / 0.684)):
         folder = tmp_path / name
         folder.mkdir()
-        kind = built(folder, hills(), blur_px).manifest.kind
+        kind = map_of(folder, hills(), blur_px).manifest.kind
         assert kind.effective_resolution_m == pytest.approx(expected_m, rel=0.15)
 
 
 def test_the_source_and_its_owner_say_what_cannot_be_measured(tmp_path):
     tags = {"ACQUISITIONDATETIME": "2023-07-14T09:12:55", "SATELLITEID": "PHR1B"}
-    kind = built(tmp_path, hills(), tags=tags.items(), heights="surface").manifest.kind
+    kind = map_of(tmp_path, hills(), tags=tags.items(), heights="surface").manifest.kind
     assert (kind.imagery_date, kind.sensor, kind.heights) == ("2023-07-14", "PHR1B", "surface")
 
 
 def test_a_cache_of_an_older_build_is_read_and_measured_when_asked(tmp_path):
-    cache = built(tmp_path, houses(hills()))
+    cache = map_of(tmp_path, houses(hills()))
     path = cache.path / MANIFEST_NAME
     manifest = json.loads(path.read_text())
     del manifest["kind"]
@@ -121,17 +117,16 @@ def test_a_sensors_name_cannot_steer_the_terminal():
 
 @pytest.mark.real
 @pytest.mark.parametrize(
-    ("name", "files", "heights", "least_m", "most_m"),
+    ("name", "share", "files", "heights", "least_m", "most_m"),
     [
-        ("fengyuan", ("ground.tif", "ortho.tif"), "flat", 0.35, 0.55),
-        ("caliterra", ("dsm.tif", "ortho.tif"), "surface", 0.0625, 0.1),
+        ("fengyuan", 0.25, ("ground.tif", "ortho.tif"), "flat", 0.35, 0.55),
+        ("caliterra", 1.0, ("dsm.tif", "ortho.tif"), "surface", 0.0625, 0.1),
     ],
 )
 def test_real_maps_are_what_their_makers_say(
-    tmp_path, real_data, name, files, heights, least_m, most_m
+    tmp_path, real_data, name, share, files, heights, least_m, most_m
 ):
-    sources = [real_data(name) / file for file in files]
-    build_cache(sources, tmp_path / "map", BuildOptions(vertical_datum="ellipsoidal", workers=1))
-    kind = TileCache.open(tmp_path / "map").manifest.kind
+    sources = [cut_out(real_data(name) / file, tmp_path / file, share) for file in files]
+    kind = built(sources, tmp_path / "map", vertical_datum="ellipsoidal").manifest.kind
     assert kind.heights == heights
     assert least_m <= kind.effective_resolution_m <= most_m
