@@ -37,11 +37,11 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
 from localizer.map.relief import ground_uncertainty
 from localizer.odometry.config import GrowthModel, OdometryConfig
-from localizer.odometry.ground import GroundUncertainty
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.world import WorldInfo
+from localizer.types import GroundUncertainty
 
 _HIGH_M = 1500.0
 _GROWTHS = ("with_map", "with_ground", "with_range", "with_plane")

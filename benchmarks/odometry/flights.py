@@ -16,14 +16,14 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryFrame
-from localizer.odometry.ground import GroundUncertainty, TerrainModel
+from localizer.odometry.ground import TerrainModel
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
 from localizer.odometry.usability import examine
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
-from localizer.types import FeaturePyramid, Image
+from localizer.types import FeaturePyramid, GroundUncertainty, Image
 
 DEPTHS = ("map", "ground", "plane", "range")
 _BEGIN_M, _BEGIN_RAD = 0.1, float(np.radians(0.05))  # sigmas: the tracker's last good fix

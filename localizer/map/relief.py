@@ -10,7 +10,7 @@ import numpy as np
 
 from localizer.map.cache.cache import TileIndex
 from localizer.map.kind import MapKind
-from localizer.odometry.ground import GroundUncertainty
+from localizer.types import GroundUncertainty
 
 _LEAST_M, _MOST_M = 50.0, 500.0  # between two places: roofs and trenches no longer count
 _LEAST_TILES, _MOST_TILES = 8, 2000

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from localizer.geometry.pose import Array
 from localizer.sensors.error_model import SENSORS
 
 
@@ -34,9 +37,8 @@ class OdometryConfig:
 
     anchors: int = 3000  # anchors per keyframe
     min_overlap: float = 0.35  # share of a keyframe's anchors in view of a usable frame
-    min_quality: float = 0.2  # registration quality of a usable one
     max_sigma_m: float = 2.0  # position sigma of a usable registration
-    chi2_threshold: float = 60.0  # squared Mahalanobis distance from the prediction, 6 dof
+    min_log_odds: float = 1.0  # of image and prediction together, as `IntegrityConfig`'s
     new_below_overlap: float = 0.7  # overlap below which a new keyframe starts
     new_below_quality: float = 0.6  # quality, as a share of the keyframe's first, likewise
     new_beyond_turn_deg: float = 25.0  # turn since the keyframe that starts a new one
@@ -70,3 +72,9 @@ class OdometryConfig:
     with_plane: GrowthModel = GrowthModel(
         registration=49.0, scale=0.045, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
     )
+
+    @property
+    def turn_sigma(self) -> Array:
+        """Sigmas (3,) of the autopilot's turn since the keyframe, rad, world axes."""
+        tilt, heading = self.turn_sigma_deg, self.heading_turn_sigma_deg
+        return np.radians([tilt, tilt, heading])

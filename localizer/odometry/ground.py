@@ -20,21 +20,6 @@ _LEAST_READINGS = 5
 _LEAST_ABOVE_M = 1.0
 
 
-@dataclass(frozen=True)
-class GroundUncertainty:
-    """Uncertainty of the ground height that odometry assumes, 1 sigma.
-
-    grade: growth of the height error, m per metre of distance from known ground
-    (`localizer.map.relief`); the default is that of hills. missing_m: mean height of objects that
-    the map lacks. model_m: a terrain model's own error: Copernicus states 2 m between neighbouring
-    places in 90 % of cases.
-    """
-
-    grade: float = 0.1
-    missing_m: float = 0.0
-    model_m: float = 1.2
-
-
 class TerrainModel(Protocol):
     """Heights of the ground: a grid, a plane, or rangefinder readings."""
 

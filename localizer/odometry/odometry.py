@@ -14,7 +14,6 @@ from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
 from localizer.odometry.ground import (
     FlatGround,
-    GroundUncertainty,
     RaisedGround,
     RangefinderGround,
     TerrainModel,
@@ -36,7 +35,7 @@ from localizer.registration.anchors import apply_sweep
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Registration
-from localizer.types import PosePrior
+from localizer.types import GroundUncertainty, PosePrior
 
 _CHI2_95 = 5.991  # two degrees of freedom
 
@@ -168,7 +167,8 @@ class VisualOdometry:
             motion=prior,
             seed=self._seed + frame.time_ns % 1_000_003,
         )
-        if reason := rejection(self.config, result, prior):
+        predicted = track.since_keyframe(self.config, prior, frame.time_ns, constraint)
+        if reason := rejection(self.config, result, keyframe, predicted):
             return self._failed(OdometryStatus.NOT_REGISTERED, reason, frame, prior, keyframe)
         sensed = (constraint, beginning.corrected(constraint))
         after = track_after(self.config, track, keyframe, result, frame.time_ns, sensed)
@@ -276,7 +276,7 @@ class VisualOdometry:
         )
         if made is not None:
             self._keyframe = replace(made, unmatched_m2=track.unmatched_m2)
-            self._track = replace(track, best=0.0)
+            self._track = replace(track, best=0.0, relative=np.zeros((6, 6)))
 
     def _is_spent(self, keyframe: Keyframe, result: Registration, track: OdometryTrack) -> bool:
         c = self.config

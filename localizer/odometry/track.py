@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from localizer.geometry.pose import Array, Pose
+from localizer.integrity.probability import log_odds
 from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.growth import (
@@ -23,6 +24,7 @@ from localizer.registration.result import Registration
 from localizer.types import PosePrior, RegistrationStatus
 
 _SEARCH_M, _SEARCH_RAD = 1.0, float(np.radians(2.0))  # sigmas of a search without a prediction
+_SPEED_SIGMA = 1.0  # m/s, of a prediction's velocity
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,24 @@ class OdometryTrack:
         sigma = np.repeat([reach, _SEARCH_RAD * (1.0 + dt)], 3)
         return PosePrior(pose, np.diag(sigma**2), time_ns, self.velocity)
 
+    def since_keyframe(
+        self,
+        config: OdometryConfig,
+        prior: PosePrior,
+        time_ns: int,
+        constraint: PoseConstraint | None,
+    ) -> PosePrior:
+        """The prediction `prior`, with its covariance relative to the keyframe: errors of both are
+        in `covariance` only.
+        """
+        dt = seconds(self.time_ns, time_ns)
+        reach = np.hypot(_SPEED_SIGMA * dt, 0.5 * config.acceleration_sigma * dt**2)
+        turn = np.repeat(_SEARCH_RAD * (1.0 + dt), 3)
+        if self.aided_rotation is not None and aided_rotation(constraint) is not None:
+            turn = config.turn_sigma
+        motion = np.diag(np.concatenate([np.repeat(reach, 3), turn]) ** 2)
+        return PosePrior(prior.world_from_camera, self.relative + motion, time_ns)
+
 
 def growth_of(config: OdometryConfig, source: DepthSource) -> GrowthModel:
     """The error growth model for a depth source."""
@@ -93,20 +113,31 @@ def growth_of(config: OdometryConfig, source: DepthSource) -> GrowthModel:
     }[source]
 
 
-def rejection(config: OdometryConfig, result: Registration, prior: PosePrior) -> str:
-    """Why a registration against the keyframe is rejected; "" if it is used."""
+def rejection(
+    config: OdometryConfig, result: Registration, keyframe: Keyframe, predicted: PosePrior
+) -> str:
+    """Why a registration against the keyframe is rejected; "" if it is used. predicted: relative to
+    the keyframe.
+
+    Image and prediction are two independent pieces of evidence, so their log likelihoods add up.
+    What does not move with the ground (dirt, fixed noise of a dark image) matches the keyframe's
+    own pose.
+    """
     if result.status is not RegistrationStatus.OK:
         return str(result.status.value)
-    if result.quality < config.min_quality:
-        return f"quality {result.quality:.2f} is below {config.min_quality:g}"
     if result.overlap < config.min_overlap:
         return f"overlap {result.overlap:.2f} is below {config.min_overlap:g}"
     sigma = float(np.sqrt(result.covariance.diagonal()[:3].max()))
     if sigma > config.max_sigma_m:
         return f"position sigma {sigma:.1f} m is beyond {config.max_sigma_m:g}"
-    distance = prior.mahalanobis_squared(result.world_from_camera, result.covariance)
-    if distance > config.chi2_threshold:
-        return "the pose contradicts the prediction"
+    pose, covariance = result.world_from_camera, result.covariance
+    distance = predicted.mahalanobis_squared(pose, covariance)
+    still = PosePrior(keyframe.world_from_camera, covariance, keyframe.time_ns)
+    if distance > still.mahalanobis_squared(pose):
+        return "the picture stands still, and the prediction does not"
+    odds = log_odds(result) - 0.5 * distance
+    if not odds >= config.min_log_odds:
+        return f"log odds {odds:.1f} are below {config.min_log_odds:g}"
     return ""
 
 
@@ -128,10 +159,8 @@ def track_after(
     relative = model.registration * result.covariance + distance_covariance(model, hop)
     pose = result.world_from_camera
     if keyframe.constraint is not None and corrected is not None:
-        turn = np.radians(
-            [config.turn_sigma_deg, config.turn_sigma_deg, config.heading_turn_sigma_deg]
-        )
-        if known := between(keyframe.constraint, corrected, begun, turn, config.rise_sigma_m):
+        turn, rise = config.turn_sigma, config.rise_sigma_m
+        if known := between(keyframe.constraint, corrected, begun, turn, rise):
             pose, relative = kalman_update(pose, relative, known)
     lever = pose.translation - begun.translation
     pose, covariance = fuse(pose, transferred(keyframe.covariance, lever) + relative, corrected)

@@ -19,7 +19,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryFrame, OdometryStatus
-from localizer.odometry.ground import GroundUncertainty, TerrainModel
+from localizer.odometry.ground import TerrainModel
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
 from localizer.odometry.usability import examine
 from localizer.registration.jngo import JNGO
@@ -30,7 +30,14 @@ from localizer.registration.priors import (
     height_constraint,
 )
 from localizer.tracking.motion import AuxiliarySensors
-from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
+from localizer.types import (
+    Anchors,
+    FeaturePyramid,
+    Frame,
+    GroundUncertainty,
+    PoseEstimate,
+    PosePrior,
+)
 
 
 def curvature_drop_m(place: Array) -> float:

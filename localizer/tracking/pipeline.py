@@ -28,7 +28,7 @@ from localizer.geometry.camera import Camera, with_field_of_view
 from localizer.geometry.geo import LocalFrame
 from localizer.integrity.probability import log_odds
 from localizer.map.kind import MapKind
-from localizer.odometry.ground import GroundUncertainty, TerrainModel
+from localizer.odometry.ground import TerrainModel
 from localizer.registration.anchors import apply_sweep, select_anchors
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
@@ -45,6 +45,7 @@ from localizer.types import (
     Anchors,
     FeaturePyramid,
     Frame,
+    GroundUncertainty,
     Image,
     PoseEstimate,
     PosePrior,

@@ -8,7 +8,7 @@ import pytest
 
 from localizer.map.kind import UNKNOWN_HEIGHT_SIGMA_M, Heights, MapKind
 from localizer.map.relief import ground_uncertainty
-from localizer.odometry.ground import GroundUncertainty
+from localizer.types import GroundUncertainty
 
 
 def tiles(side: int, rise: float) -> Any:

@@ -14,7 +14,6 @@ from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryStatus
 from localizer.odometry.ground import (
     FlatGround,
-    GroundUncertainty,
     RangefinderGround,
     TerrainModel,
     ground_points,
@@ -33,6 +32,7 @@ from localizer.registration.priors import (
     height_constraint,
 )
 from localizer.registration.sampling import sample_features
+from localizer.types import GroundUncertainty
 from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
 from tests.localizer.registration.conftest import SyntheticPlace, camera_pose
 
