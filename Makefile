@@ -61,7 +61,7 @@ $(VENV)/.demo: $(BIN)/python pyproject.toml $(LOCK)
 $(VENV)/.dev: $(BIN)/python pyproject.toml $(LOCK)
 	@echo "installing what program, tests and training need into $(VENV), minutes the first time"
 	$(INSTALL) --no-compile --editable '.[dev,train]'
-	touch $@ $(VENV)/.demo
+	touch $@
 
 # uv resolves for every Python and processor at once. torch asks for CUDA 13, a Jetson has CUDA 12:
 # two files.
