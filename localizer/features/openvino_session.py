@@ -9,6 +9,7 @@ generated sets (docs/results/speed.md).
 from __future__ import annotations
 
 import importlib.util
+import sys
 import threading
 from collections import OrderedDict
 from pathlib import Path
@@ -38,6 +39,9 @@ class OpenVinoSession:
     """
 
     def __init__(self, graph: bytes, threads: int) -> None:
+        # Importing it reports its use to a statistics service, on a thread of its own; without the
+        # package that does so it reports nothing.
+        sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
         import openvino
 
         self._openvino: Any = openvino

@@ -103,13 +103,15 @@ def test_callers_on_several_threads_have_results_of_their_own():
 
 
 def test_it_tells_its_maker_nothing():
-    """Its package brings one that reports use; only its converter calls that."""
+    """Importing it reported its use, on a thread of its own."""
     pytest.importorskip("openvino", reason="the extra openvino is not installed")
     code = (
-        "import sys, numpy; sys.addaudithook(lambda e, a: sys.exit(e) if e.startswith('socket.') "
-        "else None); from localizer.features.openvino_session import OpenVinoSession as S; "
+        "import os, sys, threading, numpy; sys.addaudithook(lambda e, a: os._exit(9) if "
+        "e.startswith('socket.') else None); "
+        "from localizer.features.openvino_session import OpenVinoSession as S; "
         f"S(open({str(SHIPPED_MODEL)!r}, 'rb').read(), 1)"
-        ".run(['confidence_0'], {'image': numpy.zeros((1, 32, 32, 3), numpy.uint8)})"
+        ".run(['confidence_0'], {'image': numpy.zeros((1, 32, 32, 3), numpy.uint8)}); "
+        "assert threading.active_count() == 1, threading.enumerate()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, text=True)
     assert done.returncode == 0, done.stderr
