@@ -200,7 +200,7 @@ def open_overview(
     levels, is_new = [], False
     squares = [_squares(cache, gsd) for gsd in GSD_M]
     paths = [folder / f"{gsd:g}.safetensors" for gsd in GSD_M]
-    _require_memory(squares, computed=not all(path.exists() for path in paths))
+    _require_memory(squares, computed=not all(map(os.path.exists, paths)))
     total, done = sum(len(s.corners) for s in squares), 0
     for plan, path in zip(squares, paths, strict=True):
         level = _read(path, plan.gsd_m)

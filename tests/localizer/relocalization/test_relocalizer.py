@@ -292,20 +292,28 @@ def test_overviews_of_models_that_are_no_longer_used_are_removed(tmp_path):
 
 def test_a_map_that_is_only_read_is_searched_all_the_same(cache, opened, monkeypatch, caplog):
     """Its partial overview cannot be finished there; the error of removing a file that was never
-    made cost the search.
+    made cost the search. So did a folder of another user, where nobody may look.
     """
     folder = cache.path / "overview" / opened.relocalizer.overview.key
     kept = (folder / "2.safetensors").read_bytes()
     (folder / "2.safetensors").unlink()
 
+    stat = os.stat
+
     def read_only(*_, **__):
         raise OSError(errno.EROFS, "Read-only file system")
+
+    def hidden(path, *args, **more):
+        if folder in Path(path).parents:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat(path, *args, **more)
 
     with TileStreamer(cache) as streamer, caplog.at_level(logging.WARNING):
         renderer = NumbaRenderer(streamer, 1)
         with monkeypatch.context() as patched:
             patched.setattr(Path, "unlink", read_only)
             patched.setattr(os, "fsync", read_only)
+            patched.setattr(os, "stat", hidden)
             found = open_overview(cache, renderer, opened.relocalizer.extractor)
         renderer.close()
     for left in folder.glob("*.new"):
