@@ -24,6 +24,7 @@ PARTS = (SIDE_BY_SIDE, VEHICLES, ALONE)
 FLIES = (
     "tests/companion/preflight/test_coverage.py",
     "tests/examples/test_bridge_examples.py",
+    "tests/mavlink_bridge/link/test_mavproxy.py",
     "tests/mavlink_bridge/link/test_routing.py",
     "tests/mavlink_bridge/preflight/test_mission.py",
     "tests/mavlink_bridge/test_look_at.py",

@@ -133,7 +133,8 @@ def rejection(
     pose, covariance = result.world_from_camera, result.covariance
     distance = predicted.mahalanobis_squared(pose, covariance)
     still = PosePrior(keyframe.world_from_camera, covariance, keyframe.time_ns)
-    if distance > still.mahalanobis_squared(pose):
+    # In a hover both are near 0: it is surer by as much as a step has to be.
+    if 0.5 * (distance - still.mahalanobis_squared(pose)) > config.min_log_odds:
         return "the picture stands still, and the prediction does not"
     odds = log_odds(result) - 0.5 * distance
     if not odds >= config.min_log_odds:

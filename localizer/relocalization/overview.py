@@ -80,21 +80,27 @@ class FeatureFile:
 
     def __init__(self, file: BinaryIO, offset: int, shape: tuple[int, int, int]) -> None:
         self.shape, self.nbytes = shape, math.prod(shape)
-        self._descriptor, self._offset = os.dup(file.fileno()), offset
+        self._descriptor, self._offset, self._name = os.dup(file.fileno()), offset, file.name
         weakref.finalize(self, os.close, self._descriptor)
         self._rows, self._strip = (0, 0), np.empty((shape[0], 0, shape[2]), np.int8)
         self._lock = threading.Lock()
 
     def __getitem__(self, at: tuple[slice, slice, slice]) -> NDArray[np.int8]:
-        """All channels of rows that follow each other, and of columns; OSError."""
+        """All channels of rows that follow each other, and of columns. `MapCacheError` if the file
+        has become shorter or cannot be read.
+        """
         channels, height, width = self.shape
         first, last, _ = at[1].indices(height)
         with self._lock:
             if self._rows != (first, last):
                 size = (last - first) * width
                 starts = (self._offset + (k * height + first) * width for k in range(channels))
-                data = b"".join(os.pread(self._descriptor, size, start) for start in starts)
-                strip = np.frombuffer(data, np.int8).reshape(channels, last - first, width)
+                try:
+                    data = b"".join(os.pread(self._descriptor, size, start) for start in starts)
+                    strip = np.frombuffer(data, np.int8).reshape(channels, last - first, width)
+                except (OSError, ValueError) as error:
+                    text = f"{self._name}: cannot be read any more ({error}): start again"
+                    raise MapCacheError(text) from error
                 self._rows, self._strip = (first, last), strip
             return self._strip[:, :, at[2]]
 

@@ -11,7 +11,7 @@ import pytest
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.ground import FlatGround
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
@@ -105,22 +105,26 @@ HARMLESS: dict[str, Spoil] = {
 }
 
 
-def flown(ground: Image, spoil: Spoil, seed: int) -> list[tuple[float, float]]:
+def flown(
+    ground: Image, spoil: Spoil, seed: int, *, hovers: bool = False, tilt_sigma_deg: float = 0.0
+) -> list[tuple[float, float]]:
     """Error, m, and its squared distance in the covariance, of each usable step; both horizontal.
-    The prediction is the tracker's.
+    The prediction is the tracker's. tilt_sigma_deg: noise of the autopilot's tilt.
     """
     extractor = DetailExtractor(load_extractor(threads=1, size=(WORKING.width, WORKING.height)))
     vo = VisualOdometry(WORKING, odometry_optimizer(JNGO(threads=1)), ground=FlatGround(0.0))
     rng, config, velocity = np.random.default_rng(seed), motion.MotionConfig(), np.zeros(3)
-    velocity[1] = SPEED_M_S
+    velocity[1] = 0.0 if hovers else SPEED_M_S
     state = motion.start(PosePrior(pose(0), BEGUN, 0, velocity), config)
     previous, steps = None, []
     for k in range(FRAMES):
-        image = spoil(view(ground, k), k, rng)
+        true = pose(0 if hovers else k)
+        image = spoil(view(ground, 0 if hovers else k), k, rng)
         usability = examine(image, previous)
         working = cv2.resize(image, (WORKING.width, WORKING.height), interpolation=cv2.INTER_AREA)
         frame = OdometryFrame(extractor.extract(working), k * STEP_NS, usability)
-        attitude = attitude_constraint(pose(k).rotation, np.radians(0.4), np.radians(3.0))
+        tilt = so3_exp(np.radians([*rng.normal(0.0, tilt_sigma_deg, 2), 0.0]))
+        attitude = attitude_constraint(tilt @ true.rotation, np.radians(0.4), np.radians(3.0))
         sensed = combine(attitude, height_constraint(HEIGHT_M, 0.5))
         previous = image
         if k == 0:
@@ -130,7 +134,7 @@ def flown(ground: Image, spoil: Spoil, seed: int) -> list[tuple[float, float]]:
         estimate = vo.step(frame, state.prior, constraint=sensed)
         if estimate.usable:
             state = motion.update(state, estimate.world_from_camera, estimate.covariance)
-            error = (estimate.world_from_camera.translation - pose(k).translation)[:2]
+            error = (estimate.world_from_camera.translation - true.translation)[:2]
             squared = error @ np.linalg.solve(estimate.covariance[:2, :2], error)
             steps.append((float(np.hypot(*error)), float(squared)))
     return steps
@@ -146,5 +150,12 @@ def test_what_does_not_show_the_ground_gives_no_wrong_step(ground, attack):
 @pytest.mark.parametrize("harmless", HARMLESS)
 def test_what_shows_the_ground_is_used(ground, harmless):
     steps = flown(ground, HARMLESS[harmless], 0)
+    assert len(steps) == FRAMES - 1
+    assert max(error for error, _ in steps) < 0.5
+
+
+def test_a_hover_is_no_picture_that_stands_still(ground):
+    """By 0.1 degrees of noise in the autopilot's tilt, half of a hover's steps were refused."""
+    steps = flown(ground, HARMLESS["dusk"], 0, hovers=True, tilt_sigma_deg=0.2)
     assert len(steps) == FRAMES - 1
     assert max(error for error, _ in steps) < 0.5

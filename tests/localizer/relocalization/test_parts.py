@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.fft
 
+from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.integrity.acceptance import IntegrityConfig
@@ -20,7 +21,7 @@ from localizer.relocalization.correlate import (
     LevelCorrelator,
     transform_patch,
 )
-from localizer.relocalization.overview import OverviewLevel, Projection
+from localizer.relocalization.overview import FeatureFile, OverviewLevel, Projection
 from localizer.relocalization.patch import footprint, rectify, with_heading
 from localizer.relocalization.search import (
     Rectification,
@@ -83,6 +84,18 @@ def test_only_ground_that_a_region_sees_asks_for_heights():
     off = replace(asked, region=SearchRegion.circle(np.array([9000.0, 0.0]), 50.0))
     assert len(trial_heights(off, ground_of(flat, off), CONFIG)) == 0
     assert ground_of(flat, query()).shape == flat.ground.shape
+
+
+def test_an_overview_that_is_cut_off_in_flight_is_named(tmp_path):
+    """numpy's error about a shape named no file and ended `companion localize` with a traceback."""
+    features, path = smooth(0, 288), tmp_path / "1.safetensors"
+    path.write_bytes(features.tobytes())
+    with path.open("r+b") as file:
+        kept = FeatureFile(file, 0, features.shape)
+        file.truncate(features.size - 1)
+    np.testing.assert_array_equal(kept[:, 7:40, 3:9], features[:, 7:40, 3:9])
+    with pytest.raises(MapCacheError, match=r"1\.safetensors: cannot be read any more"):
+        kept[:, 250:288, :]
 
 
 def test_scores_are_normalised_correlations():
