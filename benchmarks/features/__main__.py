@@ -9,7 +9,7 @@
     python -m benchmarks.features --tilts 0.5 --baselines       (what roll and pitch add)
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
-season (feature_real.py says what the real sets are). The reference is rendered 5 m and 5 deg from
+season (`real.py` says what the real sets are). The reference is rendered 5 m and 5 deg from
 the query's true pose. The direct methods go through the same `JNGO`, gradient and network with the
 fixed detail level and the number of anchors as in flight; the matchers go through PnP-RANSAC on the
 rendered depth. Generated pairs and real maps are kept below --cache. A checkpoint is chosen on

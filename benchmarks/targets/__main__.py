@@ -2,10 +2,9 @@
 
     python -m benchmarks.targets SEED [--scenario FILE] [--json out.json]
 
-Flies a scenario over a generated world (`python -m sitl world` or the demo makes it) without
-pictures: the poses err as a registration's do, the pixels as a detector's; an edge's pixel is
-within four of a leap in depth. Rays are cast into the survey's finest tiles, truth is on those of
-today's world.
+Flies a scenario over the demo's generated world, which the first use makes, without pictures: the
+poses err as a registration's do, the pixels as a detector's; an edge's pixel is within four of a
+leap in depth. Rays are cast into the survey's finest tiles, truth is on those of today's world.
 """
 
 from __future__ import annotations

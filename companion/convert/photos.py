@@ -178,7 +178,7 @@ def _pose(tags: PhotoTags, frame: LocalFrame, lift_m: float) -> StampedPose:
         if tags.wrong_place is not None:
             raise ValueError(tags.wrong_place)
         if said.position is None or tags.altitude is None:
-            raise ValueError("no position with a height in EXIF or XMP: no GNSS fix; remove it")
+            raise ValueError("no GNSS fix, or only a height above take-off, in its tags; remove it")
         at = said.position
         height_m = tags.altitude.value_m + lift_m
         position = Geodetic(at.latitude_deg, at.longitude_deg, height_m)

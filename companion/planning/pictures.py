@@ -62,7 +62,7 @@ def render_map_square(plan: MissionForecast, cache: TileCache) -> MapSquare:
 
 
 def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
-    """The path in green (holds), amber (doubtful) and red (fails), with numbered waypoints."""
+    """The path in green (works), amber (doubtful) and red (fails), with numbered waypoints."""
     picture = sheet.rgb.copy()
     for verdict in plan.verdicts:
         pixels = sheet.pixels(_places(verdict.samples))
@@ -75,7 +75,7 @@ def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
         start = sheet.pixels(_places(verdict.samples))[0]
         start = start - _half_step(verdict, verdict.samples[0], sheet.gsd_m)
         _label(picture, start, verdict.leg.name.split(" to ")[0])
-    return _with_legend(picture, ("holds", "doubtful", "will not do"))
+    return _with_legend(picture, ("works", "doubtful", "fails"))
 
 
 def heat_picture(
@@ -102,11 +102,11 @@ def heat_picture(
     )  # fmt: skip
     weight = _WASH * (count > 0)[..., None]
     picture: Image = (sheet.rgb * (1 - weight) + wash * weight).astype(np.uint8)
-    return _with_legend(picture, ("seen, holds", "doubtful", "seen, will not do"))
+    return _with_legend(picture, ("seen, works", "doubtful", "seen, fails"))
 
 
 def colour_of(judged: SampleVerdict) -> tuple[int, int, int]:
-    """RGB colour of a sample: holds, doubtful or fails."""
+    """RGB colour of a sample: works, doubtful or fails."""
     if not judged.holds:
         return _COLOURS[2]
     return _COLOURS[1] if judged.forecast.risk > _DOUBTFUL else _COLOURS[0]

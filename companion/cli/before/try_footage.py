@@ -34,7 +34,7 @@ def try_command(
     ] = None,
     log: Annotated[
         Path | None,
-        typer.Option(help="ArduPilot .bin or .tlog of the flight; default: beside the footage"),
+        typer.Option(help="the flight's .bin, .tlog or .ulg; default: beside the footage"),
     ] = None,
     camera: FootageCamera = None,
     fov: FieldOfView = None,
