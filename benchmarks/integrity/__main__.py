@@ -30,7 +30,7 @@ from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.integrity.fit import fit, fit_table
-from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
+from benchmarks.integrity.maps import DARK, SETS, TUNING, UNSEEN, load_set
 from benchmarks.integrity.report import COLUMNS, cells, rows
 from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
@@ -61,7 +61,7 @@ def main() -> None:
         more_time = deadline(args.minutes)
         wanted = args.sets if args.sets == [TUNING] else list(dict.fromkeys(_USUAL + args.sets))
         views = {n: load_set(n, args.folder, args.data, SETS[n]) for n in wanted}
-        usual = [n for n in _USUAL if n in views and n != TUNING]
+        usual = [n for n in _USUAL if n in views and n != TUNING and not n.startswith(DARK)]
         left = dict.fromkeys(args.sets, 1)
         while any(left.values()) and more_time():
             for name in (n for n in args.sets if left[n]):  # in turns, so that a part tells, too
