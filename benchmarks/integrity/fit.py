@@ -4,8 +4,8 @@ A registration is right where its patches lie on their true ground, wrong where 
 far off as that allows or on another map; what lies between teaches nothing. Of the wrong ones, the
 tenth of each set that looks most like a right one is fitted: any fit refuses the others, and they
 would hide those. Every set has the same weight, and so have its right and its wrong ones.
-"fengyuan" is kept back. Each other set is also judged by a fit that has seen no set of its kind,
-with the other tests of acceptance.
+"fengyuan" and the dark sets are kept back: fitted to those, quality would count for nothing. Each
+set is also judged by a fit that has seen no set of its kind, with the other tests of acceptance.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from benchmarks.integrity.maps import TUNING, UNSEEN
+from benchmarks.integrity.maps import DARK, TUNING, UNSEEN
 from benchmarks.integrity.run import StartOutcome
 from benchmarks.real.sets import describe
 from localizer.geometry.pose import Array
@@ -49,6 +49,7 @@ class Labelled:
     @classmethod
     def of(cls, name: str, outcomes: Sequence[StartOutcome]) -> Labelled:
         """Those of a set whose label is sure."""
+        name = name.removeprefix(DARK)
         limit = describe(name).right_m if name in _OTHER_DATE else _RIGHT_M
         known = [
             o for o in outcomes
@@ -125,7 +126,9 @@ def fit(outcomes: Sequence[StartOutcome]) -> dict[str, Any]:
     """The content of probability.json."""
     names = [n for n in dict.fromkeys(o.set for o in outcomes) if n not in _NO_LABELS]
     labelled = {n: Labelled.of(n, [o for o in outcomes if o.set == n]) for n in names}
-    sets = {n: s for n, s in labelled.items() if n not in _KEPT_BACK}
+    sets = {
+        n: s for n, s in labelled.items() if n not in _KEPT_BACK and not n.startswith(DARK)
+    }
     model = fitted_model(list(sets.values()))
     columns = zip(FEATURES, model.mean, model.spread, model.weights, strict=True)
     return {

@@ -44,13 +44,15 @@ class PatchDisplacements:
     shift: (P, 2) of the query against the map, level px. motion: (P, 2, 6) derivative of the shift
     by the pose (position and left rotation vector, world axes, as `PosePrior`), level px. rise: (P,
     2) derivative of the shift by the height of the patch's ground above the map, level px per
-    metre. ground: (P, 2) east and north of the patch, m.
+    metre. ground: (P, 2) east and north of the patch, m. matched: share of them that show the map;
+    the others match best anywhere in the search, by chance. At most 0 if all do.
     """
 
     shift: Array
     motion: Array
     rise: Array
     ground: Array
+    matched: float = 1.0
 
     @property
     def scatter_px(self) -> float:
@@ -135,9 +137,12 @@ def _displacements(grid: _PatchGrid, able: NDArray[np.bool_]) -> PatchDisplaceme
     """Each patch's best shift, to a fraction of a pixel."""
     shift = _peaks(grid.sums[able])
     measured = np.hypot(shift[:, 0], shift[:, 1]) < _MEASURED
+    offset = np.arange(-_REACH, _REACH + 1)
+    beyond_by_chance = float((np.hypot(offset[:, None], offset) >= _MEASURED).mean())
+    beyond = float((~measured).mean()) if len(measured) else 1.0
     return PatchDisplacements(
         shift[measured], grid.motion[able][measured], grid.rise[able][measured],
-        grid.ground[able][measured],
+        grid.ground[able][measured], 1.0 - beyond / beyond_by_chance,
     )  # fmt: skip
 
 
