@@ -126,9 +126,7 @@ def fit(outcomes: Sequence[StartOutcome]) -> dict[str, Any]:
     """The content of probability.json."""
     names = [n for n in dict.fromkeys(o.set for o in outcomes) if n not in _NO_LABELS]
     labelled = {n: Labelled.of(n, [o for o in outcomes if o.set == n]) for n in names}
-    sets = {
-        n: s for n, s in labelled.items() if n not in _KEPT_BACK and not n.startswith(DARK)
-    }
+    sets = {n: s for n, s in labelled.items() if n not in _KEPT_BACK and not n.startswith(DARK)}
     model = fitted_model(list(sets.values()))
     columns = zip(FEATURES, model.mean, model.spread, model.weights, strict=True)
     return {

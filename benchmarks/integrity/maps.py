@@ -39,9 +39,10 @@ SETS = {
     TUNING: 40, "generated": 40, "quito": 40, "portugal": 40, "caliterra": 50, "outdated": 30,
     "shifted": 20, "forest": 30, "water": 15, "roofs": 30, "fengyuan": 32, "neon": 32, UNSEEN: 80,
 }  # fmt: skip
+_WORLDS = (TUNING, "generated", UNSEEN)  # each begins with another world
 DARK = "dark "
 SETS |= {DARK + name: 12 for name in SETS if name not in (TUNING, UNSEEN, "shifted", "water")}
-# Share of the light and largest gain, in turns. Half the first ones' images still show the place.
+# Share of the light and largest gain, in turns.
 _LIGHTS = (
     (1 / 1024, 16.0), (1 / 2048, 16.0), (1 / 4096, 16.0), (1 / 8192, 16.0), (1 / 256, 1.0),
     (1 / 4096, 1.0),
@@ -58,12 +59,8 @@ def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]
     if name.startswith(DARK):
         return _darkened(load_set(name.removeprefix(DARK), folder, data, count))
     home = folder / name
-    if name == TUNING:
-        return load_views("generated", folder, data, count)[:VIEWS_PER_WORLD]
-    if name == "generated":
-        return load_views("generated", folder, data, VIEWS_PER_WORLD + count)[VIEWS_PER_WORLD:]
-    if name == UNSEEN:
-        first = 2 * VIEWS_PER_WORLD
+    if name in _WORLDS:
+        first = VIEWS_PER_WORLD * _WORLDS.index(name)
         return load_views("generated", folder, data, first + count)[first:]
     if name in ("quito", "portugal", "caliterra"):
         views = load_views(name, folder, data, count)
@@ -77,10 +74,11 @@ def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]
 
 
 def _darkened(views: list[BasinView]) -> list[BasinView]:
-    return [
-        replace(v, query=darken(v.query, *_LIGHTS[k % len(_LIGHTS)], np.random.default_rng((41, k))))
-        for k, v in enumerate(views)
-    ]
+    dark = []
+    for k, view in enumerate(views):
+        rng = np.random.default_rng((41, k))
+        dark.append(replace(view, query=darken(view.query, *_LIGHTS[k % len(_LIGHTS)], rng)))
+    return dark
 
 
 def shift_of(name: str) -> tuple[float, float]:

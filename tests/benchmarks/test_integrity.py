@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.fit import fit
+from benchmarks.integrity.maps import DARK
 from benchmarks.integrity.report import DISTINCT, FOCAL, LIKELY, OURS, WITHOUT, rows
 from benchmarks.integrity.run import StartOutcome, read
 from benchmarks.protection.__main__ import main
@@ -115,6 +116,15 @@ def test_the_fit_tells_right_from_wrong_on_a_set_that_it_has_not_seen():
     assert fit(swapped)["left_out"]["quito"]["right_accepted"] == 1.0  # it follows the labels
     mixed = [replace(o, ground_m=0.5 if k % 4 < 2 else 80.0) for k, o in enumerate(outcomes)]
     assert fit(mixed)["left_out"]["quito"]["wrong_accepted"] > 0  # labels that say nothing
+
+
+def test_dark_images_are_judged_by_the_fit_of_others_and_never_fitted():
+    outcomes = [*drawn("quito", 0), *drawn("forest", 1), *drawn("portugal", 2)]
+    alone = fit(outcomes)
+    fitted = fit([*outcomes, *(replace(o, set=DARK + "quito") for o in drawn("quito", 3))])
+    judged = fitted.pop("left_out")
+    assert fitted | {"left_out": alone["left_out"]} == alone
+    assert judged[DARK + "quito"]["wrong"] == HALVES["wrong"]
 
 
 def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):
