@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
@@ -53,7 +54,7 @@ class Newest:
         return bool(vehicle.get("armed")) if vehicle.get("connected") else None
 
 
-class ConsoleSource:
+class ConsoleSource(ABC):
     """Data source of the console: a running flight or a record. newest: the data to show."""
 
     def __init__(self) -> None:
@@ -72,13 +73,13 @@ class ConsoleSource:
         """Wait until there are new data, or the connection changes."""
         await self._event.wait()
 
+    @abstractmethod
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
         """Send an order; returns whether it was executed, and a text."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def run(self) -> None:
         """Read the source until cancelled."""
-        raise NotImplementedError
 
     def _wake_waiters(self) -> None:
         """Wake everybody that waits in `changed`."""

@@ -14,10 +14,10 @@ import zlib
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from localizer.pictures import shrink
 from localizer.types import Image
 
 Thumbnail = NDArray[np.float32]
@@ -189,7 +189,7 @@ def detail(small: Thumbnail) -> float:
 
 def thumbnail(image: Image) -> Thumbnail:
     """Luminance (48, 64) of a frame (H, W, 3), gray levels of 255, minus their mean."""
-    small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = shrink(image, (WIDTH, HEIGHT)).astype(np.float32)
     gray = small @ np.array([0.299, 0.587, 0.114], np.float32)
     return np.asarray(gray - gray.mean(), np.float32)
 
