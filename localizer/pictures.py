@@ -82,12 +82,12 @@ def _table(grey_range: GreyRange) -> Image:
     return np.asarray(np.clip(share, 0.0, 1.0) * 255.0 + 0.5, np.uint8)
 
 
-def shrink(image: Image, size: tuple[int, int]) -> Image:
+def shrink(image: Image, size: tuple[int, int], halved_from: int = 4) -> Image:
     """The image (H, W, 3), averaged over areas, at a smaller size (width, height). OpenCV averages
-    whole numbers of pixels ten times as fast as others, two the fastest: far too large an image is
-    halved first.
+    whole numbers of pixels ten times as fast as others, two the fastest: an image of `halved_from`
+    times the size is halved first.
     """
-    while image.shape[1] >= 4 * size[0] and image.shape[0] >= 4 * size[1]:
+    while image.shape[1] >= halved_from * size[0] and image.shape[0] >= halved_from * size[1]:
         image = _averaged(image, (image.shape[1] // 2, image.shape[0] // 2))
     return image if image.shape[1::-1] == size else _averaged(image, size)
 

@@ -66,7 +66,7 @@ class ConsoleSource(ABC):
         """Whether the source delivers data now."""
         return True
 
-    def watch(self, wanted: bool) -> None:
+    def watch(self, wanted: bool) -> None:  # noqa: B027
         """Request frames, or stop; without effect where frames come by themselves."""
 
     async def changed(self) -> None:
