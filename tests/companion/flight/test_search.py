@@ -104,7 +104,7 @@ class Falling:
 
 
 class Slow:
-    """A relocalizer that is right, and takes `wide_s` for the map and 0.4 s for a small part of it."""
+    """A relocalizer that is right; `wide_s` for the map and 0.4 s for a small part of it."""
 
     def __init__(self, autopilot):
         self.autopilot, self.queries, self.blind, self.wide_s = autopilot, [], False, 4.0
