@@ -14,9 +14,9 @@ false accept is a wrong beginning that ends accepted and more than 3 m or 3 degr
 more than 10 m). The set "tuning" is for choosing thresholds and in no figure of the report. On
 "shifted" a result counts by the place that the map's picture shows: no single picture tells that a
 map is shifted. --fit: the probability of `localizer.integrity.probability` is fitted to the
-outcomes of all sets but "shifted"; each set is also judged by a fit without its kind. --without:
-the views that another folder has outcomes of are left out, so that a limit that was chosen on those
-is held against others. The set "unseen" is run where it is named.
+outcomes of all sets but "shifted" and the dark ones; each set is also judged by a fit without its
+kind. --without: the views that another folder has outcomes of are left out, so that a limit that
+was chosen on those is held against others. The set "unseen" is run where it is named.
 """
 
 from __future__ import annotations
