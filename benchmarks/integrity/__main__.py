@@ -14,9 +14,9 @@ false accept is a wrong beginning that ends accepted and more than 3 m or 3 degr
 more than 10 m). The set "tuning" is for choosing thresholds and in no figure of the report. On
 "shifted" a result counts by the place that the map's picture shows: no single picture tells that a
 map is shifted. --fit: the probability of `localizer.integrity.probability` is fitted to the
-outcomes of all sets but "shifted"; each set is also judged by a fit without its kind. --without:
-the views that another folder has outcomes of are left out, so that a limit that was chosen on those
-is held against others. The set "unseen" is run where it is named.
+outcomes of all sets but "shifted" and the dark ones; each set is also judged by a fit without its
+kind. --without: the views that another folder has outcomes of are left out, so that a limit that
+was chosen on those is held against others. The set "unseen" is run where it is named.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.integrity.fit import fit, fit_table
-from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
+from benchmarks.integrity.maps import DARK, SETS, TUNING, UNSEEN, load_set
 from benchmarks.integrity.report import COLUMNS, cells, rows
 from benchmarks.integrity.run import StartOutcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
@@ -61,7 +61,7 @@ def main() -> None:
         more_time = deadline(args.minutes)
         wanted = args.sets if args.sets == [TUNING] else list(dict.fromkeys(_USUAL + args.sets))
         views = {n: load_set(n, args.folder, args.data, SETS[n]) for n in wanted}
-        usual = [n for n in _USUAL if n in views and n != TUNING]
+        usual = [n for n in _USUAL if n in views and n != TUNING and not n.startswith(DARK)]
         left = dict.fromkeys(args.sets, 1)
         while any(left.values()) and more_time():
             for name in (n for n in args.sets if left[n]):  # in turns, so that a part tells, too

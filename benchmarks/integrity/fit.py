@@ -4,8 +4,8 @@ A registration is right where its patches lie on their true ground, wrong where 
 far off as that allows or on another map; what lies between teaches nothing. Of the wrong ones, the
 tenth of each set that looks most like a right one is fitted: any fit refuses the others, and they
 would hide those. Every set has the same weight, and so have its right and its wrong ones.
-"fengyuan" is kept back. Each other set is also judged by a fit that has seen no set of its kind,
-with the other tests of acceptance.
+"fengyuan" and the dark sets are kept back: fitted to those, quality would count for nothing. Each
+set is also judged by a fit that has seen no set of its kind, with the other tests of acceptance.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from benchmarks.integrity.maps import TUNING, UNSEEN
+from benchmarks.integrity.maps import DARK, TUNING, UNSEEN
 from benchmarks.integrity.run import StartOutcome
 from benchmarks.real.sets import describe
 from localizer.geometry.pose import Array
 from localizer.integrity.acceptance import IntegrityConfig, ambiguity
-from localizer.integrity.probability import FEATURES, PlaceModel, evidence
+from localizer.integrity.probability import FEATURES, PlaceModel
 
 _RIGHT_M = 3.0
 _OTHER_DATE = ("fengyuan", "neon")  # whose truth or alignment is less exact
@@ -37,7 +37,7 @@ _HARDEST = 0.1  # of the wrong ones
 
 @dataclass(frozen=True)
 class Labelled:
-    """The outcomes of one kind of map. features: (N, 4); right: (N,) 1 or 0; asked: (N,) log odds
+    """The outcomes of one kind of map. features: (N, 5); right: (N,) 1 or 0; asked: (N,) log odds
     by which the other tests of acceptance ask for more.
     """
 
@@ -49,13 +49,14 @@ class Labelled:
     @classmethod
     def of(cls, name: str, outcomes: Sequence[StartOutcome]) -> Labelled:
         """Those of a set whose label is sure."""
+        name = name.removeprefix(DARK)
         limit = describe(name).right_m if name in _OTHER_DATE else _RIGHT_M
         known = [
             o for o in outcomes
             if o.ok and o.parts and not limit < o.ground_m <= 2 * limit
             and not o.kind.startswith("focal")
         ]  # fmt: skip
-        features = np.array([_features(o) for o in known]).reshape(-1, len(FEATURES))
+        features = np.array([o.evidence for o in known]).reshape(-1, len(FEATURES))
         right = np.array([o.ground_m <= limit for o in known], np.float64)
         return cls(_KIND.get(name, name), features, right, np.array([_asked(o) for o in known]))
 
@@ -82,11 +83,6 @@ class Labelled:
         """(N,) one for the right ones together, and one for the wrong ones."""
         counts = [max(float((self.right == k).sum()), _LEAST_COUNT) for k in (0, 1)]
         return 1.0 / np.take(counts, self.right.astype(int))
-
-
-def _features(outcome: StartOutcome) -> Array:
-    o = outcome
-    return evidence(o.quality, o.parts, o.votes / o.parts, o.peak, o.lead)
 
 
 def _asked(outcome: StartOutcome) -> float:
@@ -130,7 +126,7 @@ def fit(outcomes: Sequence[StartOutcome]) -> dict[str, Any]:
     """The content of probability.json."""
     names = [n for n in dict.fromkeys(o.set for o in outcomes) if n not in _NO_LABELS]
     labelled = {n: Labelled.of(n, [o for o in outcomes if o.set == n]) for n in names}
-    sets = {n: s for n, s in labelled.items() if n not in _KEPT_BACK}
+    sets = {n: s for n, s in labelled.items() if n not in _KEPT_BACK and not n.startswith(DARK)}
     model = fitted_model(list(sets.values()))
     columns = zip(FEATURES, model.mean, model.spread, model.weights, strict=True)
     return {

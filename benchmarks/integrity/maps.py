@@ -4,12 +4,14 @@
 forest (few photographs of crowns, turned and mirrored, over and over), water (nothing but waves,
 others in the query), roofs (one house on equal lots), "outdated" (portugal, of which three squares
 in ten show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
-"fengyuan" and "neon" are real photos over maps of another date (`benchmarks.real.sets`).
+"fengyuan" and "neon" are real photos over maps of another date (`benchmarks.real.sets`). "dark ..."
+is another set's first views in ever less light, until the sensor's noise is all that is left.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -29,6 +31,7 @@ from benchmarks.common.maps import build_map, write_raster
 from benchmarks.real.sets import load
 from localizer.pictures import read_rgb
 from localizer.types import Float32, Image
+from sitl.camera.faults import darken
 
 TUNING = "tuning"  # thresholds may be chosen on it, figures are those of the others
 UNSEEN = "unseen"  # two more worlds, made and run only when asked for: nobody has seen them before
@@ -36,6 +39,14 @@ SETS = {
     TUNING: 40, "generated": 40, "quito": 40, "portugal": 40, "caliterra": 50, "outdated": 30,
     "shifted": 20, "forest": 30, "water": 15, "roofs": 30, "fengyuan": 32, "neon": 32, UNSEEN: 80,
 }  # fmt: skip
+_WORLDS = (TUNING, "generated", UNSEEN)  # each begins with another world
+DARK = "dark "
+SETS |= {DARK + name: 12 for name in SETS if name not in (TUNING, UNSEEN, "shifted", "water")}
+# Share of the light and largest gain, in turns.
+_LIGHTS = (
+    (1 / 1024, 16.0), (1 / 2048, 16.0), (1 / 4096, 16.0), (1 / 8192, 16.0), (1 / 256, 1.0),
+    (1 / 4096, 1.0),
+)  # fmt: skip
 _CHANGED, _CHANGE_M = 0.3, 24.0  # share of an outdated map that has changed, side of a change
 SHIFT_M = (4.0, -3.0)  # of the orthophoto, east and north
 _SIDE_M, _GSD_M, _POST_M = 480.0, 0.2, 0.8  # of a made map, its picture and its heights
@@ -45,13 +56,11 @@ _CORNER, _CRS = (465_000.0, 5_250_000.0), "EPSG:32632"
 
 def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]:
     """The views of a set, made on the first call; a few photos are given again."""
+    if name.startswith(DARK):
+        return _darkened(load_set(name.removeprefix(DARK), folder, data, count))
     home = folder / name
-    if name == TUNING:
-        return load_views("generated", folder, data, count)[:VIEWS_PER_WORLD]
-    if name == "generated":
-        return load_views("generated", folder, data, VIEWS_PER_WORLD + count)[VIEWS_PER_WORLD:]
-    if name == UNSEEN:
-        first = 2 * VIEWS_PER_WORLD
+    if name in _WORLDS:
+        first = VIEWS_PER_WORLD * _WORLDS.index(name)
         return load_views("generated", folder, data, first + count)[first:]
     if name in ("quito", "portugal", "caliterra"):
         views = load_views(name, folder, data, count)
@@ -62,6 +71,14 @@ def load_set(name: str, folder: Path, data: Path, count: int) -> list[BasinView]
         home.mkdir(parents=True, exist_ok=True)
         {"outdated": _outdated, "shifted": _shifted}.get(name, _made)(home, folder, data, count)
     return load_kept(home)[:count]
+
+
+def _darkened(views: list[BasinView]) -> list[BasinView]:
+    dark = []
+    for k, view in enumerate(views):
+        rng = np.random.default_rng((41, k))
+        dark.append(replace(view, query=darken(view.query, *_LIGHTS[k % len(_LIGHTS)], rng)))
+    return dark
 
 
 def shift_of(name: str) -> tuple[float, float]:

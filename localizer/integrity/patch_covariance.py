@@ -6,7 +6,9 @@ scatter more, and if it lacks buildings and trees, parallax displaces every roof
 roof have the same error, so treating anchors as independent would make the sigma ten times too
 small. The pose follows the displacements by least squares, ``xi = (X'X)^-1 X'd``, with covariance
 ``(X'X)^-1 X' W X (X'X)^-1``. W is the sum of independent noise per patch, measured from the
-displacements, and of the missing heights.
+displacements, and of the missing heights. Patches that show nothing of the map, as in the dark,
+pull the pose at random and do not hold it: where a share f holds it, the noise displaces it 1 / f
+times as far.
 """
 
 from __future__ import annotations
@@ -29,13 +31,13 @@ def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Arra
     height_sigma_m: RMS of the heights that the map lacks; 0 for a surface model. None if the
     patches do not determine a pose.
     """
-    if len(patches.shift) < LEAST_PATCHES:
+    if len(patches.shift) < LEAST_PATCHES or patches.matched <= 0.0:
         return None
     rows = patches.motion.reshape(-1, 6)
     normal = rows.T @ rows
     if (inverse := scaled_inverse(normal)) is None:
         return None
-    noise_px = max(patches.scatter_px, _LEAST_PX)
+    noise_px = max(patches.scatter_px, _LEAST_PX) / patches.matched
     meat = noise_px**2 * normal
     if height_sigma_m > 0:
         pull = np.einsum("kai,ka->ki", patches.motion, patches.rise)

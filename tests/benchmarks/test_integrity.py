@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.fit import fit
+from benchmarks.integrity.maps import DARK
 from benchmarks.integrity.report import DISTINCT, FOCAL, LIKELY, OURS, WITHOUT, rows
 from benchmarks.integrity.run import StartOutcome, read
 from benchmarks.protection.__main__ import main
@@ -24,10 +25,19 @@ from mavlink_bridge.link.tlog import TlogRecorder
 HALVES = {"right": 40, "wrong": 40}
 RIGHT = StartOutcome(
     "quito", 0, "day", "near", 3.0, 3.0, True, metres=0.2, degrees=0.1, off_map_m=0.2,
-    overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0, lead=1.0,
+    overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0,
+    patch_peak=3.5, lead=1.0,
 )  # fmt: skip
 WRONG = replace(
-    RIGHT, kind="far", metres=40.0, off_map_m=40.0, votes=9, quality=0.1, peak=2.6, lead=0.01
+    RIGHT,
+    kind="far",
+    metres=40.0,
+    off_map_m=40.0,
+    votes=9,
+    quality=0.1,
+    peak=2.6,
+    patch_peak=2.0,
+    lead=0.01,
 )
 ALIKE = replace(WRONG, votes=58, quality=0.6, peak=6.0, lead=0.1)
 
@@ -38,7 +48,7 @@ def of(outcomes: list[StartOutcome], acceptance: str, name: str = "all"):
 
 
 def test_what_the_votes_let_through_and_what_they_cost():
-    torn = replace(RIGHT, votes=10, quality=0.1, peak=3.0, lead=0.02)
+    torn = replace(WRONG, kind="near", metres=0.2, off_map_m=0.2)
     outcomes = [
         RIGHT,
         torn,
@@ -106,6 +116,15 @@ def test_the_fit_tells_right_from_wrong_on_a_set_that_it_has_not_seen():
     assert fit(swapped)["left_out"]["quito"]["right_accepted"] == 1.0  # it follows the labels
     mixed = [replace(o, ground_m=0.5 if k % 4 < 2 else 80.0) for k, o in enumerate(outcomes)]
     assert fit(mixed)["left_out"]["quito"]["wrong_accepted"] > 0  # labels that say nothing
+
+
+def test_dark_images_are_judged_by_the_fit_of_others_and_never_fitted():
+    outcomes = [*drawn("quito", 0), *drawn("forest", 1), *drawn("portugal", 2)]
+    alone = fit(outcomes)
+    fitted = fit([*outcomes, *(replace(o, set=DARK + "quito") for o in drawn("quito", 3))])
+    judged = fitted.pop("left_out")
+    assert fitted | {"left_out": alone["left_out"]} == alone
+    assert judged[DARK + "quito"]["wrong"] == HALVES["wrong"]
 
 
 def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):

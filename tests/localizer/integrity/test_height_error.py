@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -132,4 +134,12 @@ def test_too_few_patches_say_nothing():
     few = PatchDisplacements(seen.shift[:5], seen.motion[:5], seen.rise[:5], seen.ground[:5])
     assert height_likelihood(few, registered(off), None) is None
     assert patch_covariance(few, 5.0) is None
+
+
+def test_a_pose_that_half_the_patches_hold_is_twice_as_uncertain():
+    seen, _ = town(0.0, 0)
+    whole, half = (patch_covariance(replace(seen, matched=f), 0.0) for f in (1.0, 0.5))
+    assert whole is not None
+    assert half == pytest.approx(4.0 * whole)
+    assert patch_covariance(replace(seen, matched=0.0), 0.0) is None
     assert CANDIDATES_M[0] == 0.0
