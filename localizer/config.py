@@ -30,7 +30,7 @@ class LocalizerConfig(BaseModel):
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
     model: Path | None = Field(None, description="ONNX feature network; null: the shipped one")
     anchors: int = Field(4000, exclude=True)  # geo-anchors per reference view
-    # a reference is used while its anchors move less, working px; 0: one per frame
+    # a reference is used while its anchors move less, px of an image 320 wide; 0: one per frame
     reference_shift_px: float = Field(2.0, exclude=True)
     renderer: RendererName = Field(
         "auto", description="auto: a GPU if there is one, otherwise numba"

@@ -11,6 +11,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
+from typer.core import TyperGroup
 from typer.models import ArgumentInfo, OptionInfo
 
 from benchmarks.site.api import api_page
@@ -77,7 +78,7 @@ def built_pages() -> dict[str, str]:
 
 def _command_page() -> str:
     lines = [_CLI]
-    for name, function in _commands("companion", app):
+    for name, function in _commands("companion", typer.main.get_group(app)):
         parameters = list(_parameters(function))
         help_text = _sentence((function.__doc__ or "").split("\n\n")[0])
         lines += [f"## {name}\n", help_text, ""]
@@ -87,15 +88,13 @@ def _command_page() -> str:
     return "\n".join(lines)
 
 
-def _commands(name: str, group: typer.Typer) -> Iterator[tuple[str, Callable[..., Any]]]:
+def _commands(name: str, group: TyperGroup) -> Iterator[tuple[str, Callable[..., Any]]]:
     """Every command's function, with the words that call it."""
-    for command in group.registered_commands:
-        if command.callback is not None:
-            word = command.name or command.callback.__name__.replace("_", "-")
-            yield f"{name} {word}", command.callback
-    for part in group.registered_groups:
-        if part.typer_instance is not None:
-            yield from _commands(f"{name} {part.name}", part.typer_instance)
+    for word, command in group.commands.items():
+        if isinstance(command, TyperGroup):
+            yield from _commands(f"{name} {word}", command)
+        elif command.callback is not None:
+            yield f"{name} {word}", inspect.unwrap(command.callback)
 
 
 def _parameters(function: Callable[..., Any]) -> Iterator[_Parameter]:

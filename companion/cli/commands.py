@@ -15,39 +15,71 @@ import itertools
 import re
 import signal
 import sys
+from collections.abc import Iterator, Mapping
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from companion.cli.before.calibrate import app as calibrate_app
-from companion.cli.before.init import init_command
-from companion.cli.before.plan import plan_command
-from companion.cli.before.shadow_check import shadow_check_command
-from companion.cli.before.try_footage import try_command
-from companion.cli.console import console_command
-from companion.cli.convert import convert_command
-from companion.cli.doctor import doctor_command, self_test_command
-from companion.cli.evaluate import evaluate_command
-from companion.cli.export import export_command, klv_command
 from companion.cli.interrupts import INTERRUPTED
-from companion.cli.key import key_command
-from companion.cli.localize import localize_command
-from companion.cli.map import app as map_app
 from companion.cli.output import tell
-from companion.cli.replay import replay_command
-from companion.cli.report import report_command
-from companion.cli.run import run_command
-from companion.cli.world import app as world_app
 from companion.errors import CompanionError, ConfigError
 from companion.versions import versions
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
+# Command to module and name below companion.cli.
+_COMMANDS = {
+    "try": "before.try_footage:try_command",
+    "shadow-check": "before.shadow_check:shadow_check_command",
+    "run": "run:run_command",
+    "init": "before.init:init_command",
+    "plan": "before.plan:plan_command",
+    "eval": "evaluate:evaluate_command",
+    "localize": "localize:localize_command",
+    "convert": "convert:convert_command",
+    "replay": "replay:replay_command",
+    "report": "report:report_command",
+    "export": "export:export_command",
+    "console": "console:console_command",
+    "klv": "export:klv_command",
+    "doctor": "doctor:doctor_command",
+    "key": "key:key_command",
+    "self-test": "doctor:self_test_command",
+    "calibrate": "before.calibrate:app",
+    "map": "map:app",
+    "world": "world:app",
+}
+
+
+class _ImportedCommands(Mapping[str, Any]):
+    """Imports a command when it is asked for: the imports of all take a second more."""
+
+    def __getitem__(self, name: str) -> Any:
+        module, attribute = _COMMANDS[name].split(":")
+        found = getattr(import_module(f"companion.cli.{module}"), attribute)
+        if isinstance(found, typer.Typer):
+            group = typer.main.get_group(found)
+            group.name = name
+            return group
+        alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        alone.command(name)(found)
+        return typer.main.get_command(alone)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_COMMANDS)
+
+    def __len__(self) -> int:
+        return len(_COMMANDS)
+
 
 class _Commands(TyperGroup):
     """Refuses options that are no finite numbers: the ranges of options let `nan` pass."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes | {"commands": _ImportedCommands()})
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         for option, value in itertools.pairwise(
@@ -82,29 +114,6 @@ def _options(
     ] = False,
 ) -> None:
     """Options of every command."""
-
-
-app.command("try")(try_command)
-app.command("shadow-check")(shadow_check_command)
-app.command("run")(run_command)
-app.command("init")(init_command)
-app.command("plan")(plan_command)
-app.command("eval")(evaluate_command)
-app.command("localize")(localize_command)
-app.command("convert")(convert_command)
-app.command("replay")(replay_command)
-app.command("report")(report_command)
-app.command("export")(export_command)
-app.command("console")(console_command)
-app.command("klv")(klv_command)
-app.command("doctor")(doctor_command)
-app.command("key")(key_command)
-app.command("self-test")(self_test_command)
-app.add_typer(
-    calibrate_app, name="calibrate", help="Camera, mounting and times, from a flight or a board."
-)
-app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
-app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from companion.writing import result_file, write_result, writing
 if TYPE_CHECKING:
     from localizer.map.importers.rules import ImportRules
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, help="Build and inspect tile caches.")
 
 CachePath = Annotated[Path, typer.Argument(help="folder of a tile cache")]
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from companion.terminal.steps import show_work
 from companion.writing import writing
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, help="Generated worlds for tests and demos.")
 
 
 @app.callback()

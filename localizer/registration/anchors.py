@@ -14,7 +14,7 @@ from localizer.geometry.shutter import Sweep
 from localizer.registration.sampling import sample_features
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32, RenderedView
 
-_CANDIDATE_STEP = 2  # px; one candidate per 2 x 2 pixels is finer than the finest feature level
+_CANDIDATES = 19_200  # enough for 4,000 anchors, in blocks of 2 x 2 pixels or larger
 _BORDER_SHARE = 0.02  # of the image's shorter side, where features see the padding
 _MAX_CURVATURE = 0.01  # second difference of 1/depth relative to 1/depth; 0 on any plane
 _EDGE_RADIUS = 2  # px around a depth edge or hole
@@ -86,9 +86,9 @@ def _candidates(
     bad = cv2.dilate((edge | hole).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
     border = max(2, round(_BORDER_SHARE * min(depth.shape)))
     bad[:border], bad[-border:], bad[:, :border], bad[:, -border:] = True, True, True, True
-    height, width = (n // _CANDIDATE_STEP for n in depth.shape)
-    jitter = rng.integers(0, _CANDIDATE_STEP, (2, height, width))
-    blocks = np.mgrid[0:height, 0:width] * _CANDIDATE_STEP + jitter
+    step = max(2, int((depth.size / _CANDIDATES) ** 0.5))
+    height, width = (n // step for n in depth.shape)
+    blocks = np.mgrid[0:height, 0:width] * step + rng.integers(0, step, (2, height, width))
     rows, columns = blocks.reshape(2, -1)
     good = ~bad[rows, columns]
     return rows[good], columns[good]

@@ -63,6 +63,8 @@ _LOOK_AHEAD_S = (1.0, 3.0)
 # The longest time that a reference is rendered ahead of the frame that it is made for.
 _LEAD_NS = 200_000_000
 
+_SHIFT_WIDTH = 320  # of the image that `reference_shift_px` is given for, px
+
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
 _BESIDE_PX = 6  # of a picture's edge, working px: features there have seen what lies beyond it
@@ -359,7 +361,7 @@ class Localizer:
         track_status = self.tracker.track_status
         holds = track_status.state is TrackingState.TRACKING and track_status.rejected_in_row == 0
         steady = holds and not self._is_loading()
-        shift_px = self._config.reference_shift_px
+        shift_px = self._config.reference_shift_px * self.camera.width / _SHIFT_WIDTH
         pose, time_ns = prior.world_from_camera, prior.time_ns
         interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
         if last is None or not steady or shift_px == 0:

@@ -17,7 +17,9 @@ from companion.errors import ConfigError
 from companion.terminal.steps import show_count
 from companion.writing import result_file, write_result
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(
+    no_args_is_help=True, help="Camera, mounting and times, from a flight or a board."
+)
 
 
 @app.command("flight")

@@ -128,10 +128,10 @@ class _Optimizer:
 class _Flight:
     """Frames 0.1 s apart, `step_m` to the east each."""
 
-    def __init__(self, step_m: float, shift_px: float = 8.0) -> None:
+    def __init__(self, step_m: float, shift_px: float = 8.0, width: int = 320) -> None:
         self.renderer, self.optimizer, self.step_m = _Renderer(), _Optimizer(), step_m
         self.loading = False
-        config = LocalizerConfig(odometry=None, reference_shift_px=shift_px)
+        config = LocalizerConfig(width=width, odometry=None, reference_shift_px=shift_px)
         self.localizer = Localizer(
             self.renderer, _Extractor(), self.optimizer,  # type: ignore[arg-type]
             CAMERA, config, is_loading=lambda: self.loading,
@@ -149,13 +149,14 @@ class _Flight:
         return self.renderer.count - before
 
 
-def test_a_slow_flight_takes_fewer_references_than_frames_and_a_fast_one_as_many():
-    slow = _Flight(step_m=2.0 * METRES_PER_PX)
+@pytest.mark.parametrize("width", [320, 640])
+def test_a_slow_flight_takes_fewer_references_than_frames_and_a_fast_one_as_many(width):
+    slow = _Flight(step_m=2.0 * METRES_PER_PX, width=width)
     slow.fly(range(5))
     assert slow.localizer.tracker.track_status.state is TrackingState.TRACKING
-    # 2 px a frame; a reference serves from 6 px before its place to 8 px behind it
+    # 2 px of 320 a frame; a reference serves from 6 px before its place to 8 px behind it
     assert slow.fly(range(5, 25)) in (2, 3)
-    fast = _Flight(step_m=10.0 * METRES_PER_PX)
+    fast = _Flight(step_m=10.0 * METRES_PER_PX, width=width)
     fast.fly(range(5))
     assert fast.fly(range(5, 15)) == 10
 
