@@ -14,6 +14,9 @@ from pathlib import Path
 _PACKAGES = ("pilot-companion", "numpy", "numba", "onnxruntime", "openvino",
              "opencv-python-headless", "av", "pymavlink")  # fmt: skip
 
+_CPUINFO, _BOARD = Path("/proc/cpuinfo"), Path("/proc/device-tree/model")
+_SIMD = r"\b(?:avx2|avx512(?:f|_vnni|_bf16)|avx_vnni|amx_\w+|asimd\w*|i8mm|bf16|sve\w*)\b"
+
 
 def versions() -> dict[str, str]:
     """Version of Python and of each package that affects results, and the machine type; packages
@@ -29,20 +32,29 @@ def versions() -> dict[str, str]:
 
 
 def made_by() -> dict[str, str]:
-    """Versions, processor and, in a checkout, the commit: the origin of a figure."""
-    commit = checkout()
-    return versions() | {"processor": processor()} | ({"commit": commit} if commit else {})
+    """Origin of a figure: versions, processor, its instructions and, in a checkout, the commit."""
+    commit, computer = checkout(), {"processor": processor(), "instructions": instructions()}
+    return versions() | computer | ({"commit": commit} if commit else {})
 
 
 def processor() -> str:
-    """Number and name of the processors."""
+    """Number and name of the processors, or of the board."""
+    named = re.search(r"^(?:model name|Model)\s*: (.+)$", _system(_CPUINFO), re.M)
+    name = named.group(1) if named else _system(_BOARD).rstrip("\0") or platform.machine()
+    return f"{os.cpu_count()} x {name.strip()}"
+
+
+def instructions() -> str:
+    """The processor's SIMD and matrix instructions, as the system names them."""
+    flags = re.search(r"^(?:flags|Features)\s*: (.+)$", _system(_CPUINFO), re.M)
+    return " ".join(re.findall(_SIMD, flags.group(1))) if flags else ""
+
+
+def _system(path: Path) -> str:
     try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+        return path.read_text(encoding="utf-8", errors="replace")
     except OSError:
-        text = ""
-    named = re.search(r"^(?:model name|Model)\s*: (.+)$", text, re.M)
-    name = named.group(1).strip() if named else platform.machine()
-    return f"{os.cpu_count()} x {name}"
+        return ""
 
 
 def checkout() -> str:

@@ -1,4 +1,6 @@
-"""Reads and writes image files through Python, because OpenCV crashes for a path not in UTF-8."""
+"""Reads and writes image files through Python, because OpenCV crashes for a path not in UTF-8.
+Shrinks images.
+"""
 
 from __future__ import annotations
 
@@ -78,6 +80,20 @@ def _table(grey_range: GreyRange) -> Image:
     low, high = grey_range
     share = (np.arange(_COUNTS, dtype=np.float32) - low) / np.float32(high - low)
     return np.asarray(np.clip(share, 0.0, 1.0) * 255.0 + 0.5, np.uint8)
+
+
+def shrink(image: Image, size: tuple[int, int], halved_from: int = 4) -> Image:
+    """The image (H, W, 3), averaged over areas, at a smaller size (width, height). OpenCV averages
+    whole numbers of pixels ten times as fast as others, two the fastest: an image of `halved_from`
+    times the size is halved first.
+    """
+    while image.shape[1] >= halved_from * size[0] and image.shape[0] >= halved_from * size[1]:
+        image = _averaged(image, (image.shape[1] // 2, image.shape[0] // 2))
+    return image if image.shape[1::-1] == size else _averaged(image, size)
+
+
+def _averaged(image: Image, size: tuple[int, int]) -> Image:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def write_rgb(path: Path, rgb: Image, jpeg_quality: int = 95) -> None:

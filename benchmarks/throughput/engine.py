@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from companion.preflight.bench import resident_mib
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Perturbation
 from localizer.evaluation.sequences import Sequence as Recorded
@@ -40,7 +41,7 @@ class _Answers:
 def engine_run(
     stack: MapStack, sequence: Recorded, config: LocalizerConfig, in_flight: int
 ) -> dict[str, float]:
-    """Frames a second, latency and processor time of the engine.
+    """Frames a second, latency, processor time and memory (without the frames) of the engine.
 
     in_flight: how many frames the engine has at a time; 0: they come when they were recorded, and
     one that finds the engine busy replaces the one that waits. Frames are decoded before.
@@ -52,7 +53,11 @@ def engine_run(
     localizer.track(frames[0], passes=3)
     answers = _Answers()
 
+    decoded_mib = sum(frame.image.nbytes for frame in frames) / 2**20
+    memory_mib: list[float] = []
+
     def take(estimate: PoseEstimate, _: ReferenceBundle) -> None:
+        memory_mib.append(resident_mib() - decoded_mib)
         answers.latency_ms.append(
             1e3 * (time.perf_counter() - answers.submitted_s[estimate.sequence])
         )
@@ -101,6 +106,7 @@ def engine_run(
         "latency_p95_ms": float(np.percentile(latency, 95)),
         "cpu_ms_per_frame": 1e3 * cpu_s / count,
         "cores_used": cpu_s / seconds,
+        "peak_mib": max(memory_mib, default=float("nan")),
         "median_m": float(np.median(answers.metres)) if answers.metres else float("nan"),
         "p95_m": float(np.percentile(answers.metres, 95)) if answers.metres else float("nan"),
         "refused": answers.refused,

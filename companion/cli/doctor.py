@@ -5,6 +5,7 @@ whether the program computes correctly on this computer.
 from __future__ import annotations
 
 import json
+import platform
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -22,13 +23,13 @@ from rich.text import Text
 from companion.cli.output import show_table, tell
 from companion.config import load_config
 from companion.terminal.steps import show_steps, show_work
-from companion.versions import made_by, processor
+from companion.versions import instructions, made_by, processor, versions
 from companion.writing import refuse_input, result_file, write_result
 from mavlink_bridge.preflight.doctor import Diagnosis
 from mavlink_bridge.preflight.rules import DoctorFinding
 
 if TYPE_CHECKING:
-    from companion.preflight.bench import BenchRow
+    from companion.preflight.self_test import SelfTestReport
 
 
 def doctor_command(
@@ -113,7 +114,7 @@ def _mark(finding: DoctorFinding) -> str:
 def self_test_command(
     out: Annotated[Path | None, typer.Option(help="figures and versions, JSON")] = None,
     bench: Annotated[
-        bool, typer.Option("--bench", help="measure speed and memory at 10, 30 and 60 frames/s")
+        bool, typer.Option("--bench", help="measure speed, memory and each stage")
     ] = False,
 ) -> None:
     """Localize over a generated map: compiles the kernels and checks this computer."""
@@ -121,33 +122,34 @@ def self_test_command(
         result_file(out, "--out", (".json",))
     from companion.preflight.self_test import self_test
 
-    rows: list[BenchRow] = []
     with tempfile.TemporaryDirectory(prefix="companion-self-test-") as folder:
-        report = self_test(
-            Path(folder),
-            lambda line: tell(f"{line} ...", err=True),
-            timed=rows.append if bench else None,
-        )
+        report = self_test(Path(folder), lambda line: tell(f"{line} ...", err=True), timed=bench)
     tell(
         f"[green]self-test passed[/]: tracked to {report.error_m:.4f} m, found to "
         f"{report.found_error_m:.4f} m, {report.frame_ms:.0f} ms of processor a frame, the first "
         f"after {report.compiled_s:.0f} s"
     )
-    if rows:
-        _show_speed(rows, report.features)
+    if bench:
+        _show_speed(report)
     if out is not None:
         data = asdict(report) | {"versions": made_by()}
-        if rows:
-            data["bench"] = [asdict(row) for row in rows]
         write_result(out, json.dumps(data, indent=1) + "\n", "--out")
 
 
-def _show_speed(rows: Sequence[BenchRow], features: str) -> None:
+def _show_speed(report: SelfTestReport) -> None:
     names = ("offered, Hz", "answered, Hz", "latency p50 / p95, ms", "processor, ms a frame",
              "cores", "peak memory, MiB")  # fmt: skip
     cells = [
         (str(row.offered_hz), f"{row.answered_hz:.1f}", f"{row.p50_ms:.0f} / {row.p95_ms:.0f}",
          f"{row.cpu_ms:.1f}", f"{row.cores:.2f}", f"{row.peak_mib:.0f}")
-        for row in rows
+        for row in report.bench
     ]  # fmt: skip
-    show_table(names, cells, f"{processor()}; {features}", names)
+    show_table(names, cells, f"{processor()}; {report.features}", names)
+    widths = sorted({row.width for row in report.stages})
+    by_stage: dict[str, list[str]] = {}
+    for row in report.stages:
+        by_stage.setdefault(row.stage, []).append(f"{row.cpu_ms:.1f} / {row.wall_ms:.1f}")
+    heads = ("processor / time on one thread, ms", *(f"width {width}" for width in widths))
+    found = [f"{k} {v}" for k, v in versions().items() if k in ("onnxruntime", "openvino", "numba")]
+    title = f"{platform.machine()}: {instructions()}; {', '.join(found)}"
+    show_table(heads, [(stage, *times) for stage, times in by_stage.items()], title, heads[1:])

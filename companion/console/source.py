@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
@@ -53,7 +54,7 @@ class Newest:
         return bool(vehicle.get("armed")) if vehicle.get("connected") else None
 
 
-class ConsoleSource:
+class ConsoleSource(ABC):
     """Data source of the console: a running flight or a record. newest: the data to show."""
 
     def __init__(self) -> None:
@@ -65,20 +66,20 @@ class ConsoleSource:
         """Whether the source delivers data now."""
         return True
 
-    def watch(self, wanted: bool) -> None:
+    def watch(self, wanted: bool) -> None:  # noqa: B027
         """Request frames, or stop; without effect where frames come by themselves."""
 
     async def changed(self) -> None:
         """Wait until there are new data, or the connection changes."""
         await self._event.wait()
 
+    @abstractmethod
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
         """Send an order; returns whether it was executed, and a text."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def run(self) -> None:
         """Read the source until cancelled."""
-        raise NotImplementedError
 
     def _wake_waiters(self) -> None:
         """Wake everybody that waits in `changed`."""

@@ -189,7 +189,7 @@ def _health(context: Assembly) -> HealthMonitor:
     engine, keeper = context.later(DualThreadEngine), context[RecordKeeper]
     streamer = context[MapStack].streamer
     autopilot, search = context.later(AutopilotPose), context.later(PlaceSearch)
-    source = context[FrameSource]
+    source = context[FrameSource]  # type: ignore[type-abstract]
     inputs = HealthInputs(
         lambda: keeper.is_complete,
         lambda: autopilot().sigma_m,
@@ -376,7 +376,8 @@ def _integrity_monitor(context: Assembly) -> IntegrityMonitor:
 
 
 def _feed(context: Assembly) -> Feed:
-    return Feed(context[FrameSource], context.channels.frames.send)
+    source = context[FrameSource]  # type: ignore[type-abstract]
+    return Feed(source, context.channels.frames.send)
 
 
 def _console(context: Assembly) -> Publisher:

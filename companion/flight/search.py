@@ -47,7 +47,9 @@ _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 2.0, math.radians(1.0)  # of a found place, a
 # about there, which takes a tenth.
 _STALE_M = 5.0
 _SPEED_SIGMA_M_S, _UNKNOWN_SPEED_M_S = 2.0, 8.0  # with the EKF's velocity, and without
-_FOLLOWED_M, _LONGEST_S = 10.0, 10.0
+_FOLLOWED_M, _LONGEST_S = 10.0, 120.0
+_LATE_S = 10.0  # after which attitude, height and mean velocity of then say less
+_MOST_MISSES = 3  # of one place: 100 km² take most of a minute, a look about a place a second
 _FOLLOWED_TILT_RAD, _FOLLOWED_HEADING_RAD = math.radians(1.0), math.radians(2.0)
 _FOLLOWED_HEIGHT_M = SENSORS.height_of_late_m
 _LEAST_BASE_S = 0.3  # between two places, for a velocity
@@ -60,22 +62,23 @@ class RelocalizationHypothesis:
     """Result of a search that took too long, for a second search near it.
 
     found: the pose at the query's frame; reachable: region of the camera at that time by its IMU,
-    None if unknown.
+    None if unknown; misses: searches near it without a result.
     """
 
     query: PlaceQuery
     found: Relocalization
     reachable: SearchRegion | None = None
+    misses: int = 0
 
     def predicted_query(
         self, query: PlaceQuery, velocity: Array | None, reachable: SearchRegion | None
     ) -> PlaceQuery | None:
         """`query`, of a later frame, limited to where the camera can be by then, with its attitude
-        and height corrected by what was found; None unless it is up to 10 s later.
+        and height corrected by what was found; None unless it is up to 120 s later.
         velocity: (3,) m/s in the map's axes, of the EKF, None if unknown; reachable: the reachable
         region at the time of the later frame.
         """
-        elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
+        elapsed_s = self.elapsed_s(query.frame.exposure_time_ns)
         if not 0.0 < elapsed_s <= _LONGEST_S:
             return None
         way, sigma_m = np.zeros(2), _speed_sigma(velocity) * elapsed_s
@@ -91,25 +94,27 @@ class RelocalizationHypothesis:
                 way, sigma_m = by_imu, grown_m
         pose = self.found.world_from_camera
         turn = query.rotation @ self.query.rotation.T
+        late = max(1.0, elapsed_s / _LATE_S)
         return replace(
             query,
             rotation=turn @ pose.rotation,
-            tilt_sigma_rad=_FOLLOWED_TILT_RAD,
-            heading_sigma_rad=_FOLLOWED_HEADING_RAD,
+            tilt_sigma_rad=min(late * _FOLLOWED_TILT_RAD, _TILT_SIGMA_RAD),
+            heading_sigma_rad=min(late * _FOLLOWED_HEADING_RAD, _HEADING_SIGMA_RAD),
             height_m=float(pose.translation[2]) + query.height_m - self.query.height_m,
-            height_sigma_m=_FOLLOWED_HEIGHT_M,
+            height_sigma_m=min(late * _FOLLOWED_HEIGHT_M, _HEIGHT_SIGMA_M),
             region=SearchRegion.circle(pose.translation[:2] + way, _FOLLOWED_M + sigma_m),
         )
 
     def velocity_to(self, later: Relocalization) -> Array | None:
         """Mean velocity (3,), m/s, map axes, to a position at least 0.3 s later; otherwise None."""
-        elapsed_s = self._elapsed_s(later.exposure_time_ns)
+        elapsed_s = self.elapsed_s(later.exposure_time_ns)
         if elapsed_s < _LEAST_BASE_S:
             return None
         way = later.world_from_camera.translation - self.found.world_from_camera.translation
         return np.asarray(way / elapsed_s)
 
-    def _elapsed_s(self, time_ns: int) -> float:
+    def elapsed_s(self, time_ns: int) -> float:
+        """From the found pose to a CLOCK_MONOTONIC time."""
         return (time_ns - self.found.exposure_time_ns) * 1e-9
 
 
@@ -236,16 +241,20 @@ class PlaceSearch:
         predicted = seen.predicted_query(query, velocity, about) if seen is not None else None
         began = self._clock()
         found = self._open.relocalizer.find(predicted or _on_plane(query), should_stop)
+        near = seen if predicted is not None else None
         if found is None:
+            if near is not None and near.misses + 1 < _MOST_MISSES:
+                self._hypothesis = replace(near, misses=near.misses + 1)
             return None
         seconds = self._clock() - began
-        if predicted is None and seconds * _speed_sigma(velocity) > _STALE_M:
+        recent = near is not None and near.elapsed_s(frame.exposure_time_ns) <= _LATE_S
+        if not recent and seconds * _speed_sigma(velocity) > _STALE_M:
             self._hypothesis = RelocalizationHypothesis(query, found, about)
             self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
             return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")
-        if velocity is None and predicted is not None and seen is not None:
-            velocity = seen.velocity_to(found)
+        if velocity is None and near is not None and recent:
+            velocity = near.velocity_to(found)
         least = np.repeat([_PLACE_SIGMA_M, _PLACE_SIGMA_RAD], 3) ** 2
         return PosePrior(
             found.world_from_camera,

@@ -11,17 +11,22 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.preflight.stages import StageTime, stage_times
 from localizer.config import LocalizerConfig
+from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.engine import DualThreadEngine
-from localizer.tracking.opening import open_localizer
+from localizer.tracking.opening import MapStack, open_localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle
 
 RATES_HZ = (10, 30, 60)
+_WIDTHS = (320, 640)  # of the stages
+_VIDEO = Camera.from_fov(1440, 1080, 60.0)
+_STAGE_FRAMES = 45
 _SECONDS = 4
 _SPEED_M_S = 10.0
 _WARM = 5  # frames that are not counted
@@ -60,6 +65,32 @@ def bench(
         yield _measured(path, poses, list(_views(path, poses, camera)), config, rate_hz)
 
 
+def bench_stages(path: Path, start: Pose, config: LocalizerConfig) -> list[StageTime]:
+    """Time of each stage on one thread at working widths of 320 and 640, over video of 1440 x 1080
+    from a lens with distortion: a flight as `bench`'s at 10 frames/s.
+    """
+    lens = replace(_VIDEO, distortion=(-1e-3, 0.0, 0.0, 0.0, 0.0))
+    poses = [
+        Pose(start.rotation, start.translation + np.array([0.0, 0.1 * _SPEED_M_S * k, 0.0]))
+        for k in range(_STAGE_FRAMES)
+    ]
+    frames = [
+        replace(view, exposure_time_ns=(k + 1) * 10**8, camera=lens)
+        for k, view in enumerate(_views(path, poses, _VIDEO))
+    ]
+    found = []
+    for width in _WIDTHS:
+        single = config.model_copy(update={"width": width, "threads": 1})
+        stack = MapStack(path, single)
+        try:
+            extractor = load_extractor(config.model, threads=1)
+            prior = PosePrior.around(poses[0], 1.0, 1.0, frames[0].exposure_time_ns)
+            found += stage_times(stack, frames, prior, single, extractor)
+        finally:
+            stack.close()
+    return found
+
+
 def _views(path: Path, poses: Sequence[Pose], camera: Camera) -> Iterator[Frame]:
     with TileStreamer(TileCache.open(path)) as streamer:
         renderer = NumbaRenderer(streamer, 1)
@@ -76,7 +107,7 @@ def _measured(
 
     def take(estimate: PoseEstimate, _: ReferenceBundle) -> None:
         latency_ms.append((time.monotonic_ns() - estimate.exposure_time_ns) * 1e-6)
-        memory_mib.append(_resident_mib())
+        memory_mib.append(resident_mib())
 
     with open_localizer(path, views[0].camera, config) as localizer:
         began_ns = time.monotonic_ns()
@@ -104,7 +135,8 @@ def _measured(
     )  # fmt: skip
 
 
-def _resident_mib() -> float:
+def resident_mib() -> float:
+    """Memory of this process, MiB; NaN if the system does not tell."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:

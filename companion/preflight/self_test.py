@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +18,8 @@ import rasterio
 from rasterio.transform import from_origin
 
 from companion.errors import CompanionError
-from companion.preflight.bench import BenchRow, bench
+from companion.preflight.bench import BenchRow, bench, bench_stages
+from companion.preflight.stages import StageTime
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
@@ -47,7 +48,7 @@ class SelfTestError(CompanionError):
 class SelfTestReport:
     """Result of the self-test. error_m: of the tracked positions, worst frame; found_error_m: of
     the search without a prior; frame_ms: processor time per frame, median; compiled_s: time to the
-    first result.
+    first result. bench, stages: of `bench` and `bench_stages`, empty if not wanted.
     """
 
     error_m: float
@@ -55,6 +56,8 @@ class SelfTestReport:
     frame_ms: float
     compiled_s: float
     features: str
+    bench: tuple[BenchRow, ...] = ()
+    stages: tuple[StageTime, ...] = ()
 
 
 def self_test(
@@ -62,10 +65,10 @@ def self_test(
     say: Callable[[str], None],
     config: LocalizerConfig | None = None,
     *,
-    timed: Callable[[BenchRow], None] | None = None,
+    timed: bool = False,
 ) -> SelfTestReport:
     """Build a map in `folder` (as `generate_map`), track frames over it and find one without a
-    prior. timed: receives the rows of `bench`, None: no bench.
+    prior. timed: measure the speed, too.
     Raises SelfTestError if a result is off by more than 0.5 m, or if none is accepted.
     """
     config = config or LocalizerConfig()
@@ -83,11 +86,11 @@ def self_test(
             f"the self-test is {worst:.2f} m off where {_GOOD_M} m is the most: this computer or "
             "its packages compute wrongly; do not fly with them"
         )
-    if timed is not None:
-        say("measuring the speed, which is only right while nothing else runs")
-        for row in bench(folder / "map", pose, frame.camera, config):
-            timed(row)
-    return report
+    if not timed:
+        return report
+    say("measuring the speed, which is only right while nothing else runs")
+    rows = tuple(bench(folder / "map", pose, frame.camera, config))
+    return replace(report, bench=rows, stages=tuple(bench_stages(folder / "map", pose, config)))
 
 
 def generate_map(folder: Path) -> TileCache:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -188,7 +189,7 @@ def has_times(container: av.container.InputContainer) -> bool:
     return not container.format.flags & Flags.no_timestamps.value
 
 
-class FrameSource:
+class FrameSource(ABC):
     """A camera feed, with its camera model, settings, counters and a state that it reports. One
     consumer iterates `frames`; `close` may be called from any thread.
     """
@@ -202,17 +203,17 @@ class FrameSource:
         self._lock = threading.Lock()
         self._counters = SourceCounters()
 
+    @abstractmethod
     def frames(self) -> Iterator[Frame]:
         """Yield frames in order of exposure, until a file ends or the source is closed.
 
         If a live stream stops, the iteration waits: the source reports its state and connects
         again.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """End `frames` and free device or socket; harmless when called again."""
-        raise NotImplementedError
 
     @property
     def counters(self) -> SourceCounters:

@@ -23,7 +23,6 @@ from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
-import safetensors.numpy
 from numpy.typing import NDArray
 
 from localizer.errors import MapCacheError
@@ -50,6 +49,8 @@ _QUANTUM = 0.01  # of a stored feature
 # Cells (sigma) of the mean that is taken away: what kind of land it is says little of where it is,
 # and without this one meadow scores as any other. Found in time: 12 of 12 instead of 9 among five.
 _LOCAL_CELLS = 8.0
+_LOCAL_REACH = 32  # cells: OpenCV's kernel ends at four sigmas
+_STRIP_CELLS = 512  # rows whose mean is taken away at a time, for 100 km² take 0.4 GB as they are
 _SAMPLE_SQUARES = 24  # that the principal components are computed from
 _GROUND_PERCENTILE = 30  # of the heights in a sample: lower than roofs and trees
 _LEAST_SHARE = 0.9  # of a square's cell that the map must cover to be compared
@@ -339,7 +340,7 @@ def _compute(
     projection = _principal(kept.values())
     n, g = _SQUARE_CELLS, _SQUARE_CELLS // GROUND_CELLS
     features = np.zeros((projection.basis.shape[1], plan.rows, plan.columns), np.int8)
-    known = np.zeros((plan.rows, plan.columns), np.float32)
+    known = np.zeros((plan.rows, plan.columns), np.bool_)
     ground = np.full((plan.rows // GROUND_CELLS, plan.columns // GROUND_CELLS), np.nan, np.float32)
     for k, (row, column) in enumerate(plan.corners):
         if should_stop():
@@ -353,8 +354,14 @@ def _compute(
         ground[i : i + g, j : j + g] = raw.ground
         progress(k + 1)
     for channel in features:
-        local = without_local_mean(channel.astype(np.float32), known)
-        channel[:] = np.rint(local).clip(-127, 127).astype(np.int8)
+        stored = channel.copy()
+        for row in range(0, plan.rows, _STRIP_CELLS):
+            last, before = row + _STRIP_CELLS, min(row, _LOCAL_REACH)
+            strip = slice(row - before, last + _LOCAL_REACH)
+            local = without_local_mean(
+                stored[strip].astype(np.float32), known[strip].astype(np.float32)
+            )[before : before + _STRIP_CELLS]
+            channel[row:last] = np.rint(local).clip(-127, 127).astype(np.int8)
     return OverviewLevel(features, ground, projection, plan.west, plan.north, plan.gsd_m)
 
 
@@ -420,21 +427,33 @@ def _level(file: BinaryIO, gsd_m: float) -> OverviewLevel:
 
 def write_level(path: Path, level: OverviewLevel) -> None:
     """Write hash and arrays atomically, with a temporary name; if impossible, only log it."""
-    content = safetensors.numpy.save(
-        {
-            "features": np.ascontiguousarray(level.features[:, :, :]),
-            "ground": np.ascontiguousarray(level.ground),
-            "mean": level.projection.mean,
-            "basis": level.projection.basis,
-            "corner": np.array([level.west, level.north], np.float64),
-        }
-    )
+    arrays: dict[str, NDArray[Any]] = {
+        "corner": np.array([level.west, level.north], np.float64),
+        "mean": level.projection.mean,
+        "basis": level.projection.basis,
+        "ground": np.ascontiguousarray(level.ground),
+        "features": np.ascontiguousarray(level.features[:, :, :]),
+    }
+    header: dict[str, object] = {}
+    end = 0
+    for name, values in arrays.items():
+        kind, end = f"{values.dtype.kind.upper()}{8 * values.itemsize}", end + values.nbytes
+        offsets = (end - values.nbytes, end)
+        header[name] = {"dtype": kind, "shape": values.shape, "data_offsets": offsets}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    # Array by array: of 100 km² safetensors makes two copies of 400 MB.
+    parts: list[Any] = [len(text).to_bytes(8, "little"), text, *arrays.values()]
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part)
     new = path.with_name(f"{path.name}.{os.getpid()}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with new.open("wb") as file:
-            file.write(hashlib.sha256(content).digest())
-            file.write(content)
+            file.write(found.digest())
+            for part in parts:
+                file.write(part)
             file.flush()
             os.fsync(file.fileno())
         new.replace(path)

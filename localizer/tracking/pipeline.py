@@ -29,6 +29,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.integrity.probability import log_odds
 from localizer.map.kind import MapKind
 from localizer.odometry.ground import TerrainModel
+from localizer.pictures import shrink
 from localizer.registration.anchors import apply_sweep, select_anchors
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
@@ -84,14 +85,12 @@ class Undistorter:
 
     def __init__(self, source: Camera, target: Camera) -> None:
         self.source, self._target = source, target
+        self._middle, size = source, (source.width, source.height)
         # Shrinking by more than 2 under bilinear sampling aliases: average before and after the
-        # undistortion. OpenCV averages whole numbers of pixels ten times as fast, two the fastest.
-        self._middle, times = source, source.width // (2 * target.width)
-        while times > 1:
-            self._middle = source.resized(self._middle.width // 2, self._middle.height // 2)
-            times //= 2
-        size = (self._middle.width, self._middle.height)
+        # undistortion, halves and whole numbers of pixels, as `shrink` does fastest.
         if source.width > 2 * target.width:
+            while self._middle.width >= 4 * target.width:
+                self._middle = source.resized(self._middle.width // 2, self._middle.height // 2)
             whole = round(self._middle.width / target.width)
             size = (whole * target.width, whole * target.height)
         pinhole = target.resized(*size)
@@ -122,20 +121,10 @@ class Undistorter:
                 f"frame {frame.sequence} is {width}x{height}, the camera model says "
                 f"{self.source.width}x{self.source.height}: give this stream's calibration"
             )
-        image = frame.image
-        while image.shape[1] > self._middle.width:
-            image = _shrink(image, (image.shape[1] // 2, image.shape[0] // 2))
+        image = shrink(frame.image, (self._middle.width, self._middle.height))
         if self._maps is not None:
             image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-        return _shrink(image, (self._target.width, self._target.height))
-
-
-def _shrink(image: Image, size: tuple[int, int]) -> Image:
-    if image.shape[1::-1] == size:
-        return image
-    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    shrunk: Image = resized.astype(np.uint8, copy=False)
-    return shrunk
+        return shrink(image, (self._target.width, self._target.height))
 
 
 def mask_unseen_features(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:

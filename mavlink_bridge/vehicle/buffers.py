@@ -149,10 +149,10 @@ class ZoomBuffer(_Buffer[VectorSample]):
         """The level at a time, linear between reports; None if unknown. The newest report is valid
         for hold_s, but only for 0.5 s while the level changes.
         """
-        hold_ns, newest = round(1e9 * hold_s), self._newest
-        if newest is not None and time_ns > newest.time_ns:
-            moves = len(self._samples) > 1 and self._samples[-2].values != newest.values
-            held_ns = MAX_GAP_NS if moves else hold_ns
+        hold_ns, samples = round(1e9 * hold_s), list(self._samples)  # another thread appends
+        if samples and time_ns > samples[-1].time_ns:
+            newest = samples[-1]
+            held_ns = MAX_GAP_NS if samples[-2:][0].values != newest.values else hold_ns
             level = newest.values[0] if time_ns - newest.time_ns <= held_ns else math.nan
             return level if math.isfinite(level) else None
         found = self._around(time_ns, _LONGEST_NS)

@@ -104,10 +104,10 @@ class Falling:
 
 
 class Slow:
-    """A relocalizer that is right, and takes 4 s for the map and 0.4 s for a small part of it."""
+    """A relocalizer that is right; `wide_s` for the map and 0.4 s for a small part of it."""
 
     def __init__(self, autopilot):
-        self.autopilot, self.queries, self.blind = autopilot, [], False
+        self.autopilot, self.queries, self.blind, self.wide_s = autopilot, [], False, 4.0
 
     @property
     def relocalizer(self):
@@ -120,7 +120,7 @@ class Slow:
         place = self.autopilot.place
         self.queries.append(query)
         wide = query.region is None or query.region.shape[0, 0] > 50.0**2
-        self.autopilot.time_s += 4.0 if wide else 0.4
+        self.autopilot.time_s += self.wide_s if wide else 0.4
         if self.blind or not (query.region is None or query.region.contains(place[:2])):
             return None
         pose = Pose(np.eye(3), place)
@@ -159,16 +159,18 @@ def test_a_place_of_seconds_ago_is_looked_for_again_where_it_can_be_by_now(slowl
     assert slow.queries[1].heading_sigma_rad < slow.queries[0].heading_sigma_rad
 
 
-def test_a_place_that_is_not_seen_again_is_forgotten(slowly):
+def test_a_place_that_three_frames_do_not_show_again_is_forgotten(slowly):
     falling = Falling()
     search, slow = slowly(falling)
     search.search(falling.frame(), lambda: False)
     slow.blind = True
-    assert search.search(falling.frame(), lambda: False) is None
+    for _ in range(3):
+        assert search.search(falling.frame(), lambda: False) is None
     slow.blind = False
     assert search.search(falling.frame(), lambda: False) is None  # the wide search anew
-    radii = [float(np.sqrt(q.region.shape[0, 0])) for q in slow.queries]
-    assert radii == pytest.approx([100.0, 42.0, 100.0])
+    near = [float(np.sqrt(q.region.shape[0, 0])) for q in slow.queries[1:-1]]
+    assert near == pytest.approx([42.0, 45.2, 48.4])
+    assert slow.queries[-1].region is None  # the fifth search
 
 
 def test_a_place_that_is_found_at_once_is_given_at_once(slowly, cache):
@@ -216,11 +218,27 @@ def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, c
     assert place.height_m - cache.frame.origin.height_m == pytest.approx(75.0, abs=0.5)
 
 
+def test_the_place_that_a_search_of_a_large_map_finds_is_followed_to_now(slowly):
+    """A search of 45 s found where the camera had been, and the next one began anew for ever."""
+    falling = Falling()
+    search, slow = slowly(falling)
+    slow.wide_s = 45.0
+    assert search.search(falling.frame(), lambda: False) is None
+    slow.wide_s = 1.0
+    assert search.search(falling.frame(), lambda: False) is None  # 3 m from where we are by now
+    prior = search.search(falling.frame(), lambda: False)
+    assert np.linalg.norm(prior.world_from_camera.translation - falling.place) < 2.0
+    assert prior.velocity == pytest.approx([3.0, 0.0, -2.0], abs=0.01)
+    followed, again = slow.queries[1:]
+    assert float(np.sqrt(followed.region.shape[0, 0])) == pytest.approx(370.0)
+    assert followed.heading_sigma_rad > again.heading_sigma_rad
+
+
 def test_a_place_of_long_ago_says_nothing(slowly):
     falling = Falling()
     search, slow = slowly(falling)
     search.search(falling.frame(), lambda: False)
-    falling.time_s += 20.0
+    falling.time_s += 120.0
     search.search(falling.frame(), lambda: False)
     assert slow.queries[1].region.centre == pytest.approx([0.0, 0.0])
 

@@ -18,6 +18,7 @@ from companion.errors import ReportError
 from companion.preflight import bench, self_test
 from companion.preflight.map_pin import map_hash
 from companion.preflight.sheet import as_html, as_text, make_sheet, write_sheet
+from companion.preflight.stages import STAGES, StageTime
 from localizer.config import LocalizerConfig
 from localizer.map.cache.cache import MANIFEST_NAME
 from mavlink_bridge.preflight.doctor import Diagnosis
@@ -147,12 +148,11 @@ def test_a_flight_over_the_made_map_is_timed(tmp_path, switch_interval):
 
 def test_the_table_and_the_file_hold_every_rate(tmp_path, monkeypatch):
     rows = [bench.BenchRow(hz, hz - 1.0, 20.0, 31.0, 22.5, 0.7, 512.0) for hz in bench.RATES_HZ]
+    stages = [StageTime(w, name, w / 100, w / 64) for w in (320, 640) for name in STAGES]
     report = self_test.SelfTestReport(0.01, 0.02, 30.0, 4.0, "tiny (onnxruntime, CPU) + detail")
 
     def tested(folder, say, *, timed):
-        for row in rows if timed is not None else ():
-            timed(row)
-        return report
+        return replace(report, bench=tuple(rows), stages=tuple(stages)) if timed else report
 
     monkeypatch.setattr(self_test, "self_test", tested)
     out = tmp_path / "figures.json"
@@ -161,7 +161,13 @@ def test_the_table_and_the_file_hold_every_rate(tmp_path, monkeypatch):
     for row in rows:
         assert f"{row.offered_hz}" in shown.stdout
     assert "tiny (onnxruntime, CPU)" in shown.stdout
-    assert [r["cpu_ms"] for r in json.loads(out.read_text())["bench"]] == [22.5] * 3
+    for cell in (*STAGES, "3.2 / 5.0", "6.4 / 10.0"):
+        assert cell in shown.stdout
+    figures = json.loads(out.read_text())
+    assert [r["cpu_ms"] for r in figures["bench"]] == [22.5] * 3
+    assert [r["stage"] for r in figures["stages"]] == [*STAGES, *STAGES]
+    assert "instructions" in figures["versions"]
     plain = CliRunner().invoke(app, ["self-test", "--out", str(out)])
     assert plain.exit_code == 0
-    assert "bench" not in json.loads(out.read_text())
+    figures = json.loads(out.read_text())
+    assert figures["bench"] == figures["stages"] == []

@@ -246,7 +246,8 @@ def test_stops_when_told(opened, query):
     assert len(calls) <= 6  # at the next heading, not at the end
 
 
-def test_the_overview_is_kept_and_a_damaged_one_is_made_again(cache, opened, caplog):
+def test_the_overview_is_kept_and_a_damaged_one_is_made_again(cache, opened, monkeypatch, caplog):
+    monkeypatch.setattr("localizer.relocalization.overview._STRIP_CELLS", 32)  # the same in strips
     first = opened.relocalizer.overview
     folder = cache.path / "overview" / first.key
     files = sorted(folder.iterdir())
