@@ -62,7 +62,8 @@ def _window_means(values: Float32) -> Float32:
     height, width = values.shape
     half = cv2.resize(values, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(half, (0, 0), _HALF_CONTRAST_PX)
-    return cv2.resize(smooth, (width, height)).astype(np.float32, copy=False)
+    means: Float32 = cv2.resize(smooth, (width, height)).astype(np.float32, copy=False)
+    return means
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
