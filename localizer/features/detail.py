@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 
 from localizer.features.extractor import FeatureExtractor
-from localizer.types import FeatureLevel, FeaturePyramid, Image
+from localizer.types import FeatureLevel, FeaturePyramid, Float32, Image
 
 _SMOOTH_PX = 0.8  # a rendered texture and a photo differ in their last half pixel
-_CONTRAST_PX = 5.0  # sigma of the window that contrast is measured in
+_HALF_CONTRAST_PX = 2.45  # sigma of the contrast's window at half the resolution: 5 px, resized
 _CONTRAST_FLOOR = 0.01  # of full brightness: below it is sensor noise
 _CONFIDENT_CONTRAST = 0.02  # contrast that counts half
 _BRIGHTNESS_SHARE = 0.3  # of brightness against derivatives: light changes it more
@@ -47,8 +47,7 @@ def detail_level(rgb: Image) -> FeatureLevel:
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) * np.float32(1 / 255)
     smooth = cv2.GaussianBlur(gray, (0, 0), _SMOOTH_PX)
-    mean = cv2.GaussianBlur(smooth, (0, 0), _CONTRAST_PX)
-    squares = cv2.GaussianBlur(smooth * smooth, (0, 0), _CONTRAST_PX)
+    mean, squares = _window_means(smooth), _window_means(smooth * smooth)
     dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
     dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
     features = np.empty(4 * gray.size, np.float32)
@@ -56,6 +55,15 @@ def detail_level(rgb: Image) -> FeatureLevel:
     planes = (plane.reshape(-1) for plane in (smooth, mean, squares, dx, dy))
     _normalise(*planes, features, confidence)
     return FeatureLevel(features.reshape(*gray.shape, 4), confidence.reshape(gray.shape), 1)
+
+
+def _window_means(values: Float32) -> Float32:
+    """Means in the contrast's window; smoothing at half the resolution takes a quarter the time."""
+    height, width = values.shape
+    half = cv2.resize(values, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(half, (0, 0), _HALF_CONTRAST_PX)
+    means: Float32 = cv2.resize(smooth, (width, height)).astype(np.float32, copy=False)
+    return means
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

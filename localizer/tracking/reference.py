@@ -1,4 +1,11 @@
-"""Decides how long a reference view is used: while the camera's view is nearly the same."""
+"""Decides how long a reference view is used: while the camera's view is nearly the same.
+
+Map features computed once from above and sampled at the anchors do not replace the rendering. Over
+a map of ground heights, up to 14 degrees off nadir (132 photos, 320 px), a reference took 10.5 ms
+of processor time instead of 25.0, but each frame 2.7 ms more, because it is resampled to the map's
+north and scale: nothing is saved at five frames a reference. The median error grew from 0.083 to
+0.106 m, and the features take 0.9 GB per km² at 0.2 m per pixel.
+"""
 
 from __future__ import annotations
 

@@ -48,6 +48,7 @@ def refused(
         ("places table . --plot /no/such/folder/a.png", "/no/such/folder"),
         ("targets 0 --height 5", "--height"),
         ("throughput run . --widths 0", "--widths"),
+        ("throughput.boards /no/such.json", "/no/such.json"),
         ("targets.by_height /no/such.json", "/no/such.json"),
     ],
 )

@@ -6,7 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.integrity_monitor.video import FrameVerdict, FrozenVideoDetector
+from companion.integrity_monitor.video import (
+    FrameVerdict,
+    FrozenVideoDetector,
+    detail,
+    thumbnail,
+)
 from localizer.types import Image
 
 HZ = 10
@@ -97,3 +102,15 @@ def test_what_comes_after_a_covered_lens_is_new() -> None:
     verdicts = watch(flown)
     assert max(v.still_s for v in verdicts[45:]) < 0.5
     assert max(v.repeat_lag_s for v in verdicts[40:]) == 0.0
+
+
+def test_a_large_frames_thumbnail_is_its_average():
+    """Halving first is faster, and changes neither brightness nor detail."""
+    large = cv2.resize(scene(), (1920, 1080), interpolation=cv2.INTER_LINEAR)
+    noise = 4.0 * np.random.default_rng(2).standard_normal(large.shape, np.float32)
+    large = np.clip(large + noise, 0, 255).astype(np.uint8)
+    gray = large.astype(np.float32).mean(axis=2)
+    wanted = cv2.resize(gray - gray.mean(), (64, 48), interpolation=cv2.INTER_AREA)
+    found = thumbnail(large)
+    assert (found - wanted).std() < 0.02 * wanted.std()
+    assert detail(found) == pytest.approx(detail(wanted), rel=0.02)

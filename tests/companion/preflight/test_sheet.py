@@ -18,9 +18,12 @@ from companion.errors import ReportError
 from companion.preflight import bench, self_test
 from companion.preflight.map_pin import map_hash
 from companion.preflight.sheet import as_html, as_text, make_sheet, write_sheet
-from companion.preflight.stages import STAGES, StageTime
+from companion.preflight.stages import STAGES, StageTime, stage_times
 from localizer.config import LocalizerConfig
+from localizer.features.extractor import load_extractor
 from localizer.map.cache.cache import MANIFEST_NAME
+from localizer.tracking.opening import MapStack
+from localizer.types import PosePrior
 from mavlink_bridge.preflight.doctor import Diagnosis
 from mavlink_bridge.preflight.rules import DoctorFinding
 
@@ -144,6 +147,22 @@ def test_a_flight_over_the_made_map_is_timed(tmp_path, switch_interval):
     assert row.cpu_ms > 0
     assert row.cores == pytest.approx(row.cpu_ms * row.answered_hz / 1e3)
     assert row.peak_mib > 50
+
+
+def test_every_stage_is_timed_and_the_odometry_goes_on(tmp_path):
+    config = LocalizerConfig(width=64, threads=1)
+    pose, frame = self_test.render_view(self_test.generate_map(tmp_path), config)
+    frames = [replace(frame, exposure_time_ns=10**9 + 10**8 * k, sequence=k) for k in range(12)]
+    stack = MapStack(tmp_path / "map", config)
+    try:
+        start = PosePrior.around(pose, 1.0, 1.0, frames[0].exposure_time_ns)
+        found = stage_times(stack, frames, start, config, load_extractor(threads=1))
+    finally:
+        stack.close()
+    assert [time.stage for time in found] == list(STAGES)
+    by_stage = {time.stage: time.cpu_ms for time in found}
+    assert min(by_stage.values()) > 0
+    assert by_stage["odometry, off the map"] > by_stage["undistort and shrink"]
 
 
 def test_the_table_and_the_file_hold_every_rate(tmp_path, monkeypatch):

@@ -216,6 +216,17 @@ def test_it_moves_with_the_image(image_detail):
     np.testing.assert_allclose(moved[inside], still[inside], atol=2e-3)
 
 
+def test_the_contrast_is_that_of_a_gaussian_window_of_five_pixels(image_detail):
+    image = bytes_of(image_detail)
+    smooth = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) / 255.0, (0, 0), 0.8)
+    mean, squares = (cv2.GaussianBlur(v, (0, 0), 5.0) for v in (smooth, smooth**2))
+    contrast = np.sqrt(squares - mean**2) + 0.01
+    inside = (slice(12, -12), slice(12, -12))
+    expected = (0.3 * (smooth - mean) / contrast)[inside]
+    difference = np.abs(detail_level(image).features[..., 0][inside] - expected)
+    assert difference.mean() < 0.02 * np.abs(expected).mean()
+
+
 def test_a_flat_image_has_no_confidence_and_no_structure():
     level = detail_level(np.full((40, 40, 3), 128, np.uint8))
     assert np.abs(level.features).max() < 1e-3
