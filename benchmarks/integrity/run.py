@@ -18,11 +18,11 @@ from localizer.errors import SequenceError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose, so3_log
+from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.integrity.probability import evidence, place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration.agreement import PatchDisplacements
+from localizer.registration.agreement import PatchAgreement, PatchDisplacements
 from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration
 from localizer.render.numba_raster import NumbaRenderer
@@ -63,6 +63,7 @@ class StartOutcome:
     parts: int = 0
     votes: int = 0
     peak: float = 0.0
+    patch_peak: float = 0.0
     lead: float = 0.0
     focal_gain: float = -1.0
     prior_sigma_m: float = 0.0
@@ -72,9 +73,13 @@ class StartOutcome:
         """Of the right place, by all the evidence."""
         if not self.ok or self.parts == 0:
             return -np.inf
-        share = self.votes / self.parts
-        features = evidence(self.quality, self.parts, share, self.peak, self.lead)
-        return place_model().log_odds(features)
+        return place_model().log_odds(self.evidence)
+
+    @property
+    def evidence(self) -> Array:
+        """(5,), as `localizer.integrity.probability` has it."""
+        votes = PatchAgreement(self.parts, self.votes, self.peak, self.patch_peak)
+        return evidence(self.quality, votes, self.lead)
 
     @property
     def right(self) -> bool:
@@ -179,6 +184,7 @@ def _outcome(
         parts=votes.patches,
         votes=votes.votes,
         peak=votes.peak,
+        patch_peak=votes.patch_peak,
         lead=min(found.lead, 1e3),
         focal_gain=max(found.focal_gain, -1.0),
         prior_sigma_m=horizontal_sigma_m(begun.prior),
