@@ -153,7 +153,7 @@ def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
     try:
         width, height = read_stream_size(feed)
     except (CompanionError, LocalizerError) as error:
-        notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
+        notes.append(f"the stream {redacted(feed)} gave no picture ({error})")
         return None
     typer.echo(f"stream: {width}x{height}")
     return width, height
@@ -173,6 +173,8 @@ def _model(
             )
         return lens.to_dict()
     width, height = size or (1280, 720)
+    if size is None:
+        notes.append(f"{width}x{height} is assumed: check width, height of camera.model")
     notes.append("camera.model is a field of view, not a calibration: docs/tutorials/my-camera.md")
     return Camera.from_fov(width, height, fov or _DEFAULT_FOV_DEG).to_dict()
 
