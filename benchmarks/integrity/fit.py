@@ -23,7 +23,7 @@ from benchmarks.integrity.run import StartOutcome
 from benchmarks.real.sets import describe
 from localizer.geometry.pose import Array
 from localizer.integrity.acceptance import IntegrityConfig, ambiguity
-from localizer.integrity.probability import FEATURES, PlaceModel, evidence
+from localizer.integrity.probability import FEATURES, PlaceModel
 
 _RIGHT_M = 3.0
 _OTHER_DATE = ("fengyuan", "neon")  # whose truth or alignment is less exact
@@ -37,7 +37,7 @@ _HARDEST = 0.1  # of the wrong ones
 
 @dataclass(frozen=True)
 class Labelled:
-    """The outcomes of one kind of map. features: (N, 4); right: (N,) 1 or 0; asked: (N,) log odds
+    """The outcomes of one kind of map. features: (N, 5); right: (N,) 1 or 0; asked: (N,) log odds
     by which the other tests of acceptance ask for more.
     """
 
@@ -56,7 +56,7 @@ class Labelled:
             if o.ok and o.parts and not limit < o.ground_m <= 2 * limit
             and not o.kind.startswith("focal")
         ]  # fmt: skip
-        features = np.array([_features(o) for o in known]).reshape(-1, len(FEATURES))
+        features = np.array([o.evidence for o in known]).reshape(-1, len(FEATURES))
         right = np.array([o.ground_m <= limit for o in known], np.float64)
         return cls(_KIND.get(name, name), features, right, np.array([_asked(o) for o in known]))
 
@@ -85,11 +85,6 @@ class Labelled:
         return 1.0 / np.take(counts, self.right.astype(int))
 
 
-def _features(outcome: StartOutcome) -> Array:
-    o = outcome
-    return evidence(o.quality, o.parts, o.votes / o.parts, o.peak, o.lead)
-
-
 def _asked(outcome: StartOutcome) -> float:
     """By the width of the prior; infinite where another test refuses it. The distance from the
     prior is none of them: here it lacks the attitude and the map's error.
@@ -111,9 +106,10 @@ def fitted_model(sets: Sequence[Labelled]) -> PlaceModel:
 def _regression(sets: Sequence[Labelled]) -> PlaceModel:
     """Logistic regression with a small ridge."""
     x = np.concatenate([s.features for s in sets])
+    x[np.isinf(x)] = np.nan
     y, weight = (np.concatenate([getattr(s, key) for s in sets]) for key in ("right", "weights"))
-    mean, spread = x.mean(axis=0), x.std(axis=0)
-    z = np.column_stack([(x - mean) / spread, np.ones(len(x))])
+    mean, spread = np.nanmean(x, axis=0), np.nanstd(x, axis=0)
+    z = np.column_stack([np.nan_to_num((x - mean) / spread), np.ones(len(x))])
     share = weight / weight.sum()
 
     def loss(b: Array) -> tuple[float, Array]:

@@ -18,11 +18,11 @@ from localizer.errors import SequenceError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose, so3_log
+from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.integrity.probability import evidence, place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration.agreement import PatchDisplacements
+from localizer.registration.agreement import PatchAgreement, PatchDisplacements
 from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration
 from localizer.render.numba_raster import NumbaRenderer
@@ -34,6 +34,7 @@ _LEAST_MAP = 0.1  # of a reference view, as in flight: with less there is no reg
 _BYTES = 96 * 2**20  # of a map's resident tiles
 _PLACES = 48  # at which views of other places are tried
 _FAR_M = 1e6  # error where the place is not on the map
+_NO_RIVAL = 1e3  # lead where there is no other mode: JSON has no infinity
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class StartOutcome:
     parts: int = 0
     votes: int = 0
     peak: float = 0.0
+    patch_peak: float = 0.0
     lead: float = 0.0
     focal_gain: float = -1.0
     prior_sigma_m: float = 0.0
@@ -72,9 +74,13 @@ class StartOutcome:
         """Of the right place, by all the evidence."""
         if not self.ok or self.parts == 0:
             return -np.inf
-        share = self.votes / self.parts
-        features = evidence(self.quality, self.parts, share, self.peak, self.lead)
-        return place_model().log_odds(features)
+        return place_model().log_odds(self.evidence)
+
+    @property
+    def evidence(self) -> Array:
+        """(5,), as `localizer.integrity.probability` has it."""
+        votes = PatchAgreement(self.parts, self.votes, self.peak, self.patch_peak)
+        return evidence(self.quality, votes, self.lead if self.lead < _NO_RIVAL else np.inf)
 
     @property
     def right(self) -> bool:
@@ -179,7 +185,8 @@ def _outcome(
         parts=votes.patches,
         votes=votes.votes,
         peak=votes.peak,
-        lead=min(found.lead, 1e3),
+        patch_peak=votes.patch_peak,
+        lead=min(found.lead, _NO_RIVAL),
         focal_gain=max(found.focal_gain, -1.0),
         prior_sigma_m=horizontal_sigma_m(begun.prior),
     )

@@ -18,11 +18,12 @@ import numpy as np
 
 from localizer.errors import ModelError
 from localizer.geometry.pose import Array
+from localizer.registration.agreement import PatchAgreement
 from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
 
 MODEL = Path(__file__).with_name("probability.json")
-FEATURES = ("log_quality", "inlier_excess", "peak", "log_lead")
+FEATURES = ("log_quality", "inlier_excess", "peak", "patch_peak", "log_lead")
 _CHANCE = 0.1  # of the patches that match where they lie, at wrong places
 _LEAST_QUALITY, _LEAST_LEAD = 0.02, 0.003  # below, a logarithm says no more
 
@@ -30,7 +31,8 @@ _LEAST_QUALITY, _LEAST_LEAD = 0.02, 0.003  # below, a logarithm says no more
 @dataclass(frozen=True)
 class PlaceModel:
     """Logistic regression of whether a registration is at the right position. Log odds = bias + sum
-    of weights times (feature - mean) / spread; arrays are (4,), in the order of `FEATURES`.
+    of weights times (feature - mean) / spread; arrays are (5,), in the order of `FEATURES`. A
+    feature that is infinite has no weight.
     """
 
     mean: Array
@@ -40,7 +42,8 @@ class PlaceModel:
 
     def log_odds(self, features: Array) -> float:
         """Natural log odds of the right position, for equal prior probabilities."""
-        return float(self.bias + self.weights @ ((features - self.mean) / self.spread))
+        known = np.where(np.isposinf(features), self.mean, features)
+        return float(self.bias + self.weights @ ((known - self.mean) / self.spread))
 
 
 @cache
@@ -61,30 +64,31 @@ def place_model(path: Path = MODEL) -> PlaceModel:
 
 
 def place_features(result: Registration) -> Array | None:
-    """Evidence (4,) of a registration, in the order of `FEATURES`; None after a failure or without
+    """Evidence (5,) of a registration, in the order of `FEATURES`; None after a failure or without
     patches.
 
-    The four values are: quality of the fit; number of patches that match at their own position,
+    The five values are: quality of the fit; number of patches that match at their own position,
     beyond chance, in sigmas; match of the whole image at its position against the matches beside
-    it, in sigmas; lead over the best other mode of the swarm.
+    it, in sigmas; the same of its best patches; lead over the best other mode of the swarm.
     """
     votes = result.agreement
     if result.status is not RegistrationStatus.OK or votes is None or votes.patches == 0:
         return None
-    return evidence(result.quality, votes.patches, votes.share, votes.peak, result.lead)
+    return evidence(result.quality, votes, result.lead)
 
 
-def evidence(quality: float, patches: int, share: float, peak: float, lead: float) -> Array:
-    """Evidence (4,) from the values of a `Registration` and its `PatchAgreement`. quality: 0 to 1;
-    patches: number of patches; share: of agreeing ones, 0 to 1; peak: in standard deviations; lead:
-    relative cost margin over the second-best mode.
+def evidence(quality: float, votes: PatchAgreement, lead: float) -> Array:
+    """Evidence (5,) from the values of a `Registration`. quality: 0 to 1; lead: relative cost
+    margin over the second-best mode, inf without one. That is no evidence: a narrow prior leaves
+    room for no other mode, at a wrong position as well.
     """
     return np.array(
         [
             np.log(max(quality, _LEAST_QUALITY)),
-            np.sqrt(patches) * (share - _CHANCE),
-            peak,
-            np.log(np.clip(lead, _LEAST_LEAD, 1.0)),
+            np.sqrt(votes.patches) * (votes.share - _CHANCE),
+            votes.peak,
+            votes.patch_peak,
+            np.inf if lead == np.inf else np.log(np.clip(lead, _LEAST_LEAD, 1.0)),
         ]
     )
 

@@ -30,6 +30,7 @@ _ANCHORS_A_PART = 8.0  # wanted: with few anchors the parts are larger
 _REACH = 6  # of the shifts compared, level px
 _NEAR = 1.5  # shift that is none, level px: 9 of 169 by chance
 _LEAST_ANCHORS = 4  # of a part, to have a vote
+_BEST = 4  # one part in so many has the best peaks: others have changed, or show nothing
 _MEASURED = 5.5  # largest displacement that is one: beyond, the peak lies at the search's edge
 
 
@@ -69,12 +70,15 @@ class PatchAgreement:
     """How the image's patches agree with a registration. patches: number of patches that can be
     compared; votes: number of those that match best at their own position; peak: match of the whole
     image at its position, minus the mean of its matches at other shifts, in their standard
-    deviations. displacements: shifts of the best matches; patches without a peak are left out.
+    deviations; patch_peak: match of a patch at its position, minus the mean of its matches, in
+    their standard deviations, mean of the best quarter. displacements: shifts of the best matches;
+    patches without a peak are left out.
     """
 
     patches: int
     votes: int
     peak: float
+    patch_peak: float
     displacements: PatchDisplacements | None = None
 
     @property
@@ -92,13 +96,24 @@ def agreement(problem: LevelProblem, rotation: Array, translation: Array) -> Pat
     offset = np.arange(-_REACH, _REACH + 1)
     distance = np.hypot(offset[:, None], offset[None])
     near = (distance <= _NEAR).ravel()
-    votes = int(near[grid.sums[able].reshape(-1, near.size).argmax(axis=1)].sum())
+    matches = grid.sums[able].reshape(-1, near.size)
+    votes = int(near[matches.argmax(axis=1)].sum())
     total = grid.sums.sum(axis=0).ravel()
     others = total[(distance > 2 * _NEAR).ravel()]
     peak = (float(total[near].max()) - float(others.mean())) / max(float(others.std()), 1e-9)
     return PatchAgreement(
-        int(able.sum()), votes, peak if len(able) else 0.0, _displacements(grid, able)
-    )
+        len(matches), votes, peak if len(able) else 0.0, _patch_peak(matches, near),
+        _displacements(grid, able),
+    )  # fmt: skip
+
+
+def _patch_peak(matches: Float32, near: NDArray[np.bool_]) -> float:
+    """`PatchAgreement`'s, of (P, n) matches at n shifts; near: (n,) shifts that are none."""
+    if len(matches) == 0:
+        return 0.0
+    height = matches[:, near].max(axis=1) - matches.mean(axis=1)
+    peaks = np.sort(height / np.maximum(matches.std(axis=1), 1e-9))
+    return float(peaks[-max(len(peaks) // _BEST, 3) :].mean())
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,19 @@ from mavlink_bridge.link.tlog import TlogRecorder
 HALVES = {"right": 40, "wrong": 40}
 RIGHT = StartOutcome(
     "quito", 0, "day", "near", 3.0, 3.0, True, metres=0.2, degrees=0.1, off_map_m=0.2,
-    overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0, lead=1.0,
+    overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0,
+    patch_peak=3.5, lead=1.0,
 )  # fmt: skip
 WRONG = replace(
-    RIGHT, kind="far", metres=40.0, off_map_m=40.0, votes=9, quality=0.1, peak=2.6, lead=0.01
+    RIGHT,
+    kind="far",
+    metres=40.0,
+    off_map_m=40.0,
+    votes=9,
+    quality=0.1,
+    peak=2.6,
+    patch_peak=2.0,
+    lead=0.01,
 )
 ALIKE = replace(WRONG, votes=58, quality=0.6, peak=6.0, lead=0.1)
 
@@ -39,7 +48,7 @@ def of(outcomes: list[StartOutcome], acceptance: str, name: str = "all"):
 
 
 def test_what_the_votes_let_through_and_what_they_cost():
-    torn = replace(RIGHT, votes=10, quality=0.1, peak=3.0, lead=0.02)
+    torn = replace(WRONG, kind="near", metres=0.2, off_map_m=0.2)
     outcomes = [
         RIGHT,
         torn,

@@ -27,7 +27,7 @@ from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
 
 CONFIG = IntegrityConfig()
-GOOD = PatchAgreement(patches=60, votes=50, peak=6.0)
+GOOD = PatchAgreement(patches=60, votes=50, peak=6.0, patch_peak=3.5)
 
 
 def _registration(**change: Any) -> Registration:
@@ -42,7 +42,7 @@ def _registration(**change: Any) -> Registration:
     [
         {"status": RegistrationStatus.NO_TEXTURE},
         {"overlap": 0.1},
-        {"quality": 0.05, "agreement": PatchAgreement(patches=60, votes=8, peak=2.5)},
+        {"quality": 0.05, "agreement": PatchAgreement(60, 8, 2.5, 2.1)},
         {"agreement": None},
     ],
 )
@@ -54,7 +54,7 @@ def test_every_criterion_can_reject(change: dict[str, Any]) -> None:
 def test_a_damaged_place_model_is_named(tmp_path: Path) -> None:
     text = MODEL.read_text(encoding="utf-8")
     missing = tmp_path / "missing.json"
-    damaged = ["", text[:200], "[]", '{"features": {}, "bias": 0}', text.replace("log_lead", "x")]
+    damaged = ["", text[:200], "[]", '{"features": {}, "bias": 0}', text.replace("patch_peak", "x")]
     files = [tmp_path / f"{k}.json" for k in range(len(damaged))]
     for path, content in zip(files, damaged, strict=True):
         path.write_text(content, encoding="utf-8")
@@ -68,9 +68,7 @@ def test_a_contradicted_prediction_rejects() -> None:
 
 
 def test_a_wide_prior_asks_for_more_evidence() -> None:
-    doubtful = _registration(
-        quality=0.4, lead=0.2, agreement=PatchAgreement(patches=60, votes=30, peak=5.0)
-    )
+    doubtful = _registration(quality=0.4, lead=0.2, agreement=PatchAgreement(60, 30, 5.0, 2.9))
     assert is_acceptable(CONFIG, doubtful, 1.0, prior_sigma_m=3.0)
     assert not is_acceptable(CONFIG, doubtful, 1.0, prior_sigma_m=200.0)
     assert is_acceptable(CONFIG, _registration(), 1.0, prior_sigma_m=50.0)
@@ -81,15 +79,16 @@ def test_each_kind_of_evidence_counts() -> None:
     less = [
         replace(base, quality=0.2),
         replace(base, lead=0.01),
-        replace(base, agreement=PatchAgreement(60, 20, 6.0)),
-        replace(base, agreement=PatchAgreement(60, 50, 3.0)),
+        replace(base, agreement=PatchAgreement(60, 20, 6.0, 3.5)),
+        replace(base, agreement=PatchAgreement(60, 50, 3.0, 3.5)),
+        replace(base, agreement=PatchAgreement(60, 50, 6.0, 2.1)),
     ]
     assert all(log_odds(worse) < log_odds(base) for worse in less)
 
 
-@pytest.mark.parametrize("earlier", [0.9, -math.inf, math.nan])
+@pytest.mark.parametrize("earlier", [0.6, -math.inf, math.nan])
 def test_every_pass_over_an_image_must_show_the_place(earlier):
-    assert is_acceptable(CONFIG, _registration(earlier_log_odds=1.1), 1.0)
+    assert is_acceptable(CONFIG, _registration(earlier_log_odds=0.8), 1.0)
     assert not is_acceptable(CONFIG, _registration(earlier_log_odds=earlier), 1.0)
 
 
@@ -101,14 +100,15 @@ def test_another_focal_length_that_fits_better_rejects() -> None:
 EVIDENCE = st.fixed_dictionaries(
     {
         "overlap": st.floats(0, 1), "quality": st.floats(0, 1), "lead": st.floats(0, 2),
-        "votes": st.integers(0, 60), "peak": st.floats(0, 12),
+        "votes": st.integers(0, 60), "peak": st.floats(0, 12), "patch_peak": st.floats(0, 8),
     }
 )  # fmt: skip
 
 
 def _with(evidence: dict[str, Any]) -> Registration:
-    found = PatchAgreement(patches=60, votes=evidence["votes"], peak=evidence["peak"])
-    rest = {k: v for k, v in evidence.items() if k not in ("votes", "peak")}
+    of_patches = {k: evidence[k] for k in ("votes", "peak", "patch_peak")}
+    found = PatchAgreement(patches=60, **of_patches)
+    rest = {k: v for k, v in evidence.items() if k not in of_patches}
     return _registration(agreement=found, **rest)
 
 
@@ -122,9 +122,16 @@ def test_more_evidence_or_a_narrower_prior_never_costs_an_accepted_place(
         assert is_acceptable(CONFIG, more, distance_squared, min(sigma_m, other_m))
 
 
-@pytest.mark.parametrize("name", ["overlap", "quality", "lead", "peak"])
+@pytest.mark.parametrize("name", ["overlap", "quality", "lead", "peak", "patch_peak"])
 def test_evidence_that_is_no_number_accepts_nothing(name):
-    good = {"overlap": 0.9, "quality": 0.6, "lead": 1.0, "votes": 50, "peak": 6.0}
+    good = {
+        "overlap": 0.9,
+        "quality": 0.6,
+        "lead": 1.0,
+        "votes": 50,
+        "peak": 6.0,
+        "patch_peak": 3.5,
+    }
     assert is_acceptable(CONFIG, _with(good), 1.0)
     assert not is_acceptable(CONFIG, _with(good | {name: math.nan}), 1.0)
     assert not is_acceptable(CONFIG, _with(good), math.nan)

@@ -114,6 +114,7 @@ def test_parts_agree_on_the_truth_and_not_on_a_place_elsewhere(scene_factory):
         assert right.share > 0.9
         assert wrong.share < 0.35
         assert right.peak > wrong.peak
+        assert right.patch_peak > wrong.patch_peak
         assert right.displacements is not None
         assert wrong.displacements is not None
         assert right.displacements.matched == 1.0

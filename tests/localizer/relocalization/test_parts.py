@@ -353,9 +353,9 @@ def test_the_shift_of_an_image_is_found_and_moves_the_camera():
 @pytest.mark.parametrize(
     ("patches", "contradicted", "credible"),
     [
-        (PatchAgreement(60, 54, 6.0), False, True),
-        (PatchAgreement(60, 12, 3.0), False, False),
-        (PatchAgreement(60, 54, 6.0), True, False),
+        (PatchAgreement(60, 54, 6.0, 3.5), False, True),
+        (PatchAgreement(60, 12, 3.0, 2.1), False, False),
+        (PatchAgreement(60, 54, 6.0, 3.5), True, False),
         (None, False, False),
     ],
 )

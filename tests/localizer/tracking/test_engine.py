@@ -83,7 +83,7 @@ class FakeOptimizer:
         self.error: Exception | None = None
         self.status = RegistrationStatus.OK
         self.offset = np.zeros(3)
-        self.agreement = PatchAgreement(patches=60, votes=58, peak=6.0)
+        self.agreement = PatchAgreement(patches=60, votes=58, peak=6.0, patch_peak=3.5)
         self.focal_gain = -np.inf
 
     def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
@@ -274,7 +274,7 @@ def test_a_jump_against_the_prediction_is_not_accepted():
 @pytest.mark.parametrize(("sigma_m", "accepted"), [(3.0, True), (20.0, False)])
 def test_of_equal_roofs_only_a_narrow_prior_says_which(sigma_m, accepted):
     optimizer = FakeOptimizer()
-    optimizer.agreement = PatchAgreement(patches=60, votes=22, peak=4.2)
+    optimizer.agreement = PatchAgreement(patches=60, votes=22, peak=4.2, patch_peak=2.3)
     localizer = _localizer(optimizer=optimizer)
     localizer.set_prior(PosePrior(NADIR, np.diag([sigma_m**2] * 3 + [1.0] * 3), 10**9))
     assert localizer.track(_frame(0)).accepted is accepted

@@ -121,7 +121,7 @@ class _Optimizer:
 
     def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
         pose = Pose(NADIR.rotation, NADIR.translation + np.array([self.east_m, 0.0, 0.0]))
-        seen = PatchAgreement(patches=60, votes=58, peak=6.0)
+        seen = PatchAgreement(patches=60, votes=58, peak=6.0, patch_peak=3.5)
         return Registration(pose, np.eye(6) * 1e-4, 0.1, 0.9, 0.8, self.status, 1, seen)
 
 
