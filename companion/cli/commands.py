@@ -87,7 +87,9 @@ class _Commands(TyperGroup):
         ):
             if option.startswith("--") and re.fullmatch(r"(?i)[+-]?(nan|inf(inity)?)", value):
                 raise ConfigError(f"{option} {value}: give a finite number")
-        return super().resolve_command(ctx, args)
+        found = super().resolve_command(ctx, args)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the command is imported
+        return found
 
 
 app = typer.Typer(
@@ -119,7 +121,6 @@ def _options(
 def main() -> None:
     """Entry point: named errors become one clear line and exit code 2."""
     try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # the imports are over
         app()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

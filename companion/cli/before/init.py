@@ -153,7 +153,7 @@ def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
     try:
         width, height = read_stream_size(feed)
     except (CompanionError, LocalizerError) as error:
-        notes.append(f"the stream {redacted(feed)} gave no picture ({error})")
+        notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
         return None
     typer.echo(f"stream: {width}x{height}")
     return width, height
