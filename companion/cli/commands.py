@@ -23,7 +23,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from companion.cli.interrupts import INTERRUPTED
+from companion.cli.interrupts import INTERRUPTED, end_at_once
 from companion.cli.output import tell
 from companion.errors import CompanionError, ConfigError
 from companion.versions import versions
@@ -88,7 +88,8 @@ class _Commands(TyperGroup):
             if option.startswith("--") and re.fullmatch(r"(?i)[+-]?(nan|inf(inity)?)", value):
                 raise ConfigError(f"{option} {value}: give a finite number")
         found = super().resolve_command(ctx, args)
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # the command is imported
+        if signal.getsignal(signal.SIGINT) is end_at_once:  # the command is imported
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         return found
 
 
