@@ -68,6 +68,10 @@ class _ImportedCommands(Mapping[str, Any]):
         alone.command(name)(found)
         return typer.main.get_command(alone)
 
+    def get(self, name: str, default: Any = None) -> Any:
+        """A KeyError of the import is not "no such command"."""
+        return self[name] if name in _COMMANDS else default
+
     def __iter__(self) -> Iterator[str]:
         return iter(_COMMANDS)
 
