@@ -3,9 +3,9 @@
 A model is two files: ``NAME.onnx`` and ``NAME.json``. The graph takes ``image`` (1, H, W, 3) uint8
 RGB with H and W divisible by the description's `multiple`. For each level, coarse to fine, it gives
 ``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w) float32
-in (0, 1). The JSON file names the levels and has the SHA-256 of the graph. If it says `orientation`,
-the graph gives ``learned_K`` (1, h, w, C - 7) float32 instead, from which `orientation_level` makes
-both.
+in (0, 1). The JSON file names the levels and has the SHA-256 of the graph. If `orientation` is true
+there, the graph gives ``learned_K`` (1, h, w, C - 7) float32 instead, from which
+`orientation_level` makes both.
 """
 
 from __future__ import annotations

@@ -8,9 +8,10 @@ fifth of the time that a runtime for networks takes for its many small steps.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from localizer.registration.cpu.algebra import JIT
 from localizer.types import FeatureLevel, Float32, Image
@@ -37,15 +38,15 @@ def orientation_level(gray: Float32, stride: int, learned: Float32 | None = None
     distance, and n features of any length, which follow the orientation's channels.
     """
     h, w = gray.shape[0] // stride, gray.shape[1] // stride
-    extra = 0 if learned is None else learned.shape[2] - 1
-    features = np.empty((h, w, CHANNELS + extra), np.float32)
-    confidence = np.empty((h, w), np.float32)
     bins = np.empty((ORIENTATIONS, h, w), np.float32)
-    _histogram(gray, stride, _reduction(stride), _gaussian(1.0), _DIRECTIONS, bins)
-    _normalise(bins, _gaussian(6.0), features, confidence)
-    if learned is not None:
+    _histogram(gray, stride, _reduction(stride), _BLUR, _DIRECTIONS, bins)
+    if learned is None:
+        share, learned = np.ones((h, w), np.float32), np.empty((h, w, 1), np.float32)
+    else:
         share = 1.0 / (1.0 + np.exp(-learned[:, :, 0]))
-        _join(learned.reshape(h * w, -1), share.reshape(-1), features.reshape(h * w, -1))
+    features = np.empty((h, w, CHANNELS + learned.shape[2] - 1), np.float32)
+    confidence = np.empty((h, w), np.float32)
+    _normalise(bins, _SURROUND, share, learned, features, confidence)
     return FeatureLevel(features, confidence, stride)
 
 
@@ -57,10 +58,19 @@ def _gaussian(sigma: float) -> Float32:
     return (kernel / kernel.sum()).astype(np.float32)
 
 
+def _even(taps: Float32) -> Float32:
+    """Symmetric taps with an even number of pairs, by two zeros."""
+    return np.pad(taps, len(taps) // 2 % 2).astype(np.float32)
+
+
+@cache
 def _reduction(stride: int) -> Float32:
     """The filter before one pixel in `stride` is taken: smoothed, and averaged over the area."""
     area = np.full(stride, np.float32(1 / stride))
-    return np.convolve(_gaussian(0.6 * stride), area).astype(np.float32)
+    return _even(np.convolve(_gaussian(0.6 * stride), area))
+
+
+_BLUR, _SURROUND = _even(_gaussian(1.0)), _even(_gaussian(6.0))
 
 
 @njit(**JIT)
@@ -71,33 +81,52 @@ def _weigh_colours(rgb, weights, gray):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
+def _add_pairs(taps, k, a, b, c, d, out):  # type: ignore[no-untyped-def]
+    """Two pairs of symmetric taps at once: half the loads and stores."""
+    s, t = taps[k], taps[k + 1]
+    for x in range(len(out)):
+        out[x] += s * (a[x] + b[x]) + t * (c[x] + d[x])
+
+
+@njit(**JIT)
 def _filter(values, taps, stride, out):  # type: ignore[no-untyped-def]
-    """Filter along both axes, sampled every `stride` pixels, borders replicated."""
+    """Filter along both axes, sampled every `stride` pixels, borders replicated. taps: of
+    `_even`.
+    """
     height, width = values.shape
     h, w = out.shape
-    before = (len(taps) - stride) // 2
-    line = np.empty(width + len(taps), np.float32)
+    size = len(taps)
+    half, before = size // 2, (size - stride) // 2
+    line = np.empty(width + size, np.float32)
+    phases = np.empty((stride, (width + size) // stride), np.float32)
     for y in range(h):
-        row = line[before : before + width]
-        row[:] = 0
-        for k in range(len(taps)):
-            source, tap = values[min(max(y * stride + k - before, 0), height - 1)], taps[k]
-            for x in range(width):
-                row[x] += tap * source[x]
-        line[:before], line[before + width :] = row[0], row[width - 1]
-        target = out[y]
-        if stride == 1:
-            target[:] = 0
-            for k in range(len(taps)):
-                tap = taps[k]
-                for x in range(w):
-                    target[x] += tap * line[x + k]
+        row, first = line[before : before + width], y * stride - before
+        if size % 2:
+            row[:] = taps[half] * values[min(max(first + half, 0), height - 1)]
         else:
-            for x in range(w):
-                total = np.float32(0)
-                for k in range(len(taps)):
-                    total += taps[k] * line[x * stride + k]
-                target[x] = total
+            row[:] = 0
+        for k in range(0, half, 2):
+            a, b = min(max(first + k, 0), height - 1), min(max(first + k + 1, 0), height - 1)
+            c = min(max(first + size - 1 - k, 0), height - 1)
+            d = min(max(first + size - 2 - k, 0), height - 1)
+            _add_pairs(taps, k, values[a], values[c], values[b], values[d], row)
+        line[:before], line[before + width :] = row[0], row[width - 1]
+        for p in range(stride):
+            phase = phases[p]
+            for x in range(len(phase)):
+                phase[x] = line[x * stride + p]
+        target = out[y]
+        if size % 2:
+            target[:] = taps[half] * phases[half % stride, half // stride :][:w]
+        else:
+            target[:] = 0
+        for k in range(0, half, 2):
+            m, n = size - 1 - k, size - 2 - k
+            _add_pairs(
+                taps, k, phases[k % stride, k // stride :], phases[m % stride, m // stride :],
+                phases[(k + 1) % stride, (k + 1) // stride :], phases[n % stride, n // stride :],
+                target,
+            )  # fmt: skip
 
 
 @njit(**JIT)
@@ -106,7 +135,7 @@ def _histogram(gray, stride, reduction, blur, directions, bins):  # type: ignore
     small, response = np.empty((h, w), np.float32), np.empty(bins.shape, np.float32)
     magnitude, double_x, double_y = np.empty((3, w), np.float32)
     _filter(gray, reduction, stride, small)
-    least, two, zero = np.float32(1e-12), np.float32(2), np.float32(0)
+    least, two, one, zero = np.float32(1e-12), np.float32(2), np.float32(1), np.float32(0)
     padded = np.empty((3, w + 2), np.float32)
     for y in range(h):
         for k in range(3):
@@ -120,52 +149,46 @@ def _histogram(gray, stride, reduction, blur, directions, bins):  # type: ignore
             gy -= above[x + 2]
             square = gx * gx + gy * gy + least
             magnitude[x] = np.sqrt(square)
-            double_x[x], double_y[x] = (gx * gx - gy * gy) / square, two * gx * gy / square
-        for k in range(len(bins)):
+            inverse = one / square
+            double_x[x], double_y[x] = (gx * gx - gy * gy) * inverse, two * gx * gy * inverse
+        for k in range(ORIENTATIONS):
             a, b, row = directions[k, 0], directions[k, 1], response[k, y]
             for x in range(w):
                 along = max(a * double_x[x] + b * double_y[x], zero)
                 row[x] = along * along * magnitude[x]
-    for k in range(len(bins)):
+    for k in range(ORIENTATIONS):
         _filter(response[k], blur, 1, bins[k])
 
 
 @njit(**JIT)
-def _normalise(bins, surround, features, confidence):  # type: ignore[no-untyped-def]
-    count, h, w = bins.shape
+def _normalise(bins, surround, share, learned, features, confidence):  # type: ignore[no-untyped-def]
+    h, w = confidence.shape
+    extra = learned.shape[2] - 1
     energy2, around = np.zeros((h, w), np.float32), np.empty((h, w), np.float32)
-    for k in range(count):
+    for k in range(ORIENTATIONS):
         for y in range(h):
             for x in range(w):
                 energy2[y, x] += bins[k, y, x] * bins[k, y, x]
     _filter(energy2, surround, 1, around)
-    share, floor, one = np.float32(0.3), np.float32(0.01), np.float32(1)
-    inverse = np.empty(w, np.float32)
+    relative, floor, one = np.float32(0.3), np.float32(0.01), np.float32(1)
+    fixed, rest = np.empty((2, w), np.float32)
     for y in range(h):
         for x in range(w):
             # What counts as flat is relative to the neighbourhood and never below sensor noise.
-            flat = share * np.sqrt(around[y, x]) + floor
+            flat = relative * np.sqrt(around[y, x]) + floor
             energy = np.sqrt(energy2[y, x])
-            inverse[x] = one / np.sqrt(energy2[y, x] + flat * flat)
             confidence[y, x] = energy / (energy + flat)
+            fixed[x] = np.sqrt(share[y, x] / (energy2[y, x] + flat * flat))
+            rest[x] = one - share[y, x]
             around[y, x] = flat
         for x in range(w):
-            for k in range(count):
-                features[y, x, k] = bins[k, y, x] * inverse[x]
-            features[y, x, count] = around[y, x] * inverse[x]
-
-
-@njit(**JIT)
-def _join(learned, share, features):  # type: ignore[no-untyped-def]
-    """Scale the orientation's channels by their share, and append the learned ones by the rest."""
-    extra, one = learned.shape[1] - 1, np.float32(1)
-    fixed = features.shape[1] - extra
-    for i in range(len(learned)):
-        kept, squares = np.sqrt(share[i]), np.float32(1e-8)
-        for k in range(fixed):
-            features[i, k] *= kept
-        for k in range(extra):
-            squares += learned[i, 1 + k] * learned[i, 1 + k]
-        scale = np.sqrt((one - share[i]) / squares)
-        for k in range(extra):
-            features[i, fixed + k] = scale * learned[i, 1 + k]
+            for k in range(ORIENTATIONS):
+                features[y, x, k] = bins[k, y, x] * fixed[x]
+            features[y, x, ORIENTATIONS] = around[y, x] * fixed[x]
+            raw, out = learned[y, x, 1:], features[y, x, CHANNELS:]
+            squares = np.float32(1e-8)
+            for k in range(extra):
+                squares += raw[k] * raw[k]
+            scale = np.sqrt(rest[x] / squares)
+            for k in range(extra):
+                out[k] = scale * raw[k]
