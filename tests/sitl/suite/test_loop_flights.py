@@ -18,7 +18,6 @@ from sitl.suite.loop.evaluation import evaluate
 from sitl.suite.loop.flight import LoopAssets, fly
 
 
-
 def _short(case: LoopCase) -> LoopCase:
     """A quick climb to 45 m instead of 80, and events 5 s sooner: all is flown in real time."""
     sooner_s = 5.0 if case.timeline else 0.0
