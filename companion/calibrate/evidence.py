@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.calibrate import unknowns as u
 from companion.calibrate.pictures import Parts
-from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
+from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, so3_exp, so3_log
@@ -202,10 +202,10 @@ def autopilot_window_at(
         if attitude is None or gimbal is None:
             return None
         if where is None:
-            enu, to_ned = np.full(3, np.nan), ned_from_world(frame, frame.origin)
+            enu, to_ned = np.full(3, np.nan), frame.ned_from_enu(frame.origin)
         else:
             enu = np.asarray(frame.enu_from_geodetic(where[0], where[1], where[2] + geoid_m))
-            to_ned = ned_from_world(frame, frame.position(enu))
+            to_ned = frame.ned_from_enu(frame.position(enu))
         camera.append(to_ned.T @ matrix_from_quaternion(gimbal.quaternion) @ mount.T)
         body.append(to_ned.T @ matrix_from_quaternion(attitude.quaternion))
         place.append(enu)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.geometry import ned_from_world
 from companion.recorded.cameras import camera_given
 from companion.recorded.flight import (
     HEADING_DEG,
@@ -112,7 +111,7 @@ def _pose(said: Telemetry, frame: LocalFrame, geoid_m: float) -> Pose | None:
         return None
     p = Geodetic(said.position.latitude_deg, said.position.longitude_deg, height)
     centre = np.asarray(frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m))
-    return Pose(ned_from_world(frame, p).T @ said.view.ned_from_camera, centre)
+    return Pose(frame.ned_from_enu(p).T @ said.view.ned_from_camera, centre)
 
 
 def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:
