@@ -22,8 +22,8 @@ from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics, target_report
 from companion.errors import ConfigError
 from companion.flight.calibration_observer import CalibrationObserver
+from companion.flight.channels import Feed
 from companion.flight.components import Assembly, Component
-from companion.flight.feed import Feed
 from companion.flight.health import HealthInputs, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory

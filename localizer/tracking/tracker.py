@@ -6,13 +6,14 @@ import threading
 from dataclasses import dataclass, field, replace
 
 from localizer.config import LocalizerConfig
+from localizer.geometry.pose import Array, so3_log
 from localizer.geometry.shutter import Sweep
 from localizer.integrity.acceptance import is_acceptable
 from localizer.integrity.confirmation import IndependentEvidence
 from localizer.registration.result import Registration
 from localizer.tracking import motion
 from localizer.tracking.dead_reckoning import DeadReckoning, PropagatedPose, PropagationResult
-from localizer.tracking.motion import AuxiliarySensors, MeasuredMotion, MotionState
+from localizer.tracking.motion import AuxiliarySensors, MotionState
 from localizer.tracking.rejoining import Rejoining
 from localizer.tracking.sensor_fusion import FusedRegistration
 from localizer.tracking.states import RegistrationOutcome, TrackStatus, next_status
@@ -25,6 +26,8 @@ from localizer.types import (
     RegistrationStatus,
     TrackingState,
 )
+
+_LEAST_RATE_NS = 15_000_000  # to both sides of an exposure: sensors report every 20 ms
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,6 @@ class Tracker:
         dead_reckoning: DeadReckoning | None,
     ) -> None:
         self._config = config
-        self._motion = MeasuredMotion(config.motion, sensors.rotation_at)
         self._sensors = sensors
         self._dead_reckoning = dead_reckoning
         self._rejoining = Rejoining()
@@ -77,7 +79,7 @@ class Tracker:
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction; None before the first prior."""
         state = self.state.motion
-        return self._motion.predict(state, time_ns).prior if state else None
+        return self._moved(state, time_ns).prior if state else None
 
     def at_frame(self, seen: TrackerState, time_ns: int) -> MotionState | None:
         """The motion of `seen`, extrapolated to a frame's exposure; None before the first prior.
@@ -85,13 +87,36 @@ class Tracker:
         For an exposure before that motion's time (the camera's clock jumped) the pose is kept, its
         sigmas are those of a search, and the velocity is unknown.
         """
-        return self._motion.at_frame(seen.motion, time_ns) if seen.motion is not None else None
+        state = seen.motion
+        if state is None:
+            return None
+        if time_ns >= state.time_ns:
+            return self._moved(state, time_ns)
+        # By its velocity the state would be moved the wrong way.
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.reset_motion(state, time_ns, self._config.motion, turn)
 
     def sweep(self, frame: Frame, ahead: MotionState) -> Sweep | None:
         """The camera's motion while a rolling shutter reads the frame; None for a global shutter.
-        ahead: the motion at the frame's exposure.
+        ahead: the motion at the frame's exposure. The rotation comes from the other sensor, if its
+        data surround the exposure; otherwise from the motion model.
         """
-        return self._motion.sweep(ahead, frame.camera.readout_ms)
+        readout_ms = frame.camera.readout_ms
+        if readout_ms <= 0:
+            return None
+        half_ns = max(round(0.5e6 * readout_ms), _LEAST_RATE_NS)
+        turn = self._turn(ahead.time_ns - half_ns, ahead.time_ns + half_ns)
+        rate = ahead.rate if turn is None else so3_log(turn) / (2e-9 * half_ns)
+        return Sweep.of(rate, ahead.velocity, readout_ms)
+
+    def _moved(self, state: MotionState, time_ns: int) -> MotionState:
+        """The state at another time, with the rotation that was measured in between, if any."""
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.predict(state, time_ns, self._config.motion, turn)
+
+    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        begin, end = self._sensors.rotation_at(begin_ns), self._sensors.rotation_at(end_ns)
+        return end @ begin.T if begin is not None and end is not None else None
 
     def update(
         self,
