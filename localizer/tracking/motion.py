@@ -180,6 +180,11 @@ class AuxiliarySensors:
     height_at: Callable[[int], float | None] = lambda _time_ns: None
     clearance_at: Callable[[int], float | None] = lambda _time_ns: None
 
+    def turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        """Rotation (3, 3) of the camera between two times, in world axes; None if unknown."""
+        begin, end = self.rotation_at(begin_ns), self.rotation_at(end_ns)
+        return end @ begin.T if begin is not None and end is not None else None
+
 
 def _limits(config: MotionConfig) -> Array:
     """Sigmas (12,) of a state of which only the approximate pose is known."""

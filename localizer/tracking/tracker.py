@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass, field, replace
 
 from localizer.config import LocalizerConfig
-from localizer.geometry.pose import Array, so3_log
+from localizer.geometry.pose import so3_log
 from localizer.geometry.shutter import Sweep
 from localizer.integrity.acceptance import is_acceptable
 from localizer.integrity.confirmation import IndependentEvidence
@@ -79,7 +79,10 @@ class Tracker:
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction; None before the first prior."""
         state = self.state.motion
-        return self._moved(state, time_ns).prior if state else None
+        if state is None:
+            return None
+        turn = self._sensors.turn(state.time_ns, time_ns)
+        return motion.predict(state, time_ns, self._config.motion, turn).prior
 
     def at_frame(self, seen: TrackerState, time_ns: int) -> MotionState | None:
         """The motion of `seen`, extrapolated to a frame's exposure; None before the first prior.
@@ -90,11 +93,10 @@ class Tracker:
         state = seen.motion
         if state is None:
             return None
-        if time_ns >= state.time_ns:
-            return self._moved(state, time_ns)
-        # By its velocity the state would be moved the wrong way.
-        turn = self._turn(state.time_ns, time_ns)
-        return motion.reset_motion(state, time_ns, self._config.motion, turn)
+        turn = self._sensors.turn(state.time_ns, time_ns)
+        # Back in time its velocity would move the state the wrong way.
+        move = motion.predict if time_ns >= state.time_ns else motion.reset_motion
+        return move(state, time_ns, self._config.motion, turn)
 
     def sweep(self, frame: Frame, ahead: MotionState) -> Sweep | None:
         """The camera's motion while a rolling shutter reads the frame; None for a global shutter.
@@ -105,18 +107,9 @@ class Tracker:
         if readout_ms <= 0:
             return None
         half_ns = max(round(0.5e6 * readout_ms), _LEAST_RATE_NS)
-        turn = self._turn(ahead.time_ns - half_ns, ahead.time_ns + half_ns)
+        turn = self._sensors.turn(ahead.time_ns - half_ns, ahead.time_ns + half_ns)
         rate = ahead.rate if turn is None else so3_log(turn) / (2e-9 * half_ns)
         return Sweep.of(rate, ahead.velocity, readout_ms)
-
-    def _moved(self, state: MotionState, time_ns: int) -> MotionState:
-        """The state at another time, with the rotation that was measured in between, if any."""
-        turn = self._turn(state.time_ns, time_ns)
-        return motion.predict(state, time_ns, self._config.motion, turn)
-
-    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
-        begin, end = self._sensors.rotation_at(begin_ns), self._sensors.rotation_at(end_ns)
-        return end @ begin.T if begin is not None and end is not None else None
 
     def update(
         self,
@@ -159,17 +152,13 @@ class Tracker:
             moved = motion.start(_restart(result, ahead), self._config.motion)
         self._store(seen, moved, track_status)
         estimate = _estimate(frame, outcome, result, carried, track_status)
-        if estimate.accepted and not bridges:
+        is_fix = estimate.accepted and not bridges
+        if is_fix:
             # Position and tilt err together, from frame to frame again; the turn between two frames
             # is known several times better. The sigmas told stay the registration's: the map errs
             # alike for seconds, which a filter takes for knowledge.
             estimate = replace(estimate, world_from_camera=moved.prior.world_from_camera)
-        if (
-            estimate.accepted
-            and not bridges
-            and self._dead_reckoning is not None
-            and anchors is not None
-        ):
+        if is_fix and self._dead_reckoning is not None and anchors is not None:
             swept = self.sweep(frame, ahead)
             self._dead_reckoning.begin(estimate, query, anchors, moved.velocity, swept)
         return estimate
