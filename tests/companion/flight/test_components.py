@@ -158,7 +158,8 @@ def test_the_guardian_is_made_of_a_deployment_in_a_folder_whose_name_is_no_utf8(
 
 @pytest.mark.parametrize("policy", ["tell", "apply"])
 def test_fixes_are_corrected_by_the_maps_offset_only_where_that_is_wanted(policy):
-    checks, observers = [], []
+    checks: list[Any] = []
+    observers: list[Any] = []
     fixes = SimpleNamespace(add_check=checks.append, add_observer=observers.append)
     config = _config(connection="tcp:127.0.0.1:5763", injection={"map_shift": policy})
     parts: list[Component[Any]] = [
