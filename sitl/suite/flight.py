@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,6 +12,7 @@ from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.messages import VisionFix
 from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
@@ -19,7 +20,7 @@ from sitl.suite.case import Case, CaseEvent
 from sitl.suite.doctor import run_doctor
 from sitl.suite.ramp import RunningRamp
 from sitl.suite.record import CaseRecord, Text, VehicleSample
-from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink
+from sitl.suite.simulated_localizer import BridgeFeed, FixModel
 from sitl.vehicles.launch import VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
 
@@ -132,16 +133,16 @@ class _CaseFlight:
         self._bridge = Bridge(config, GEOID_M)
         self._bridge.start()
         self._stack.callback(self._bridge.stop)
-        sink = self._guarded(self._bridge, config)
-        self._feed = BridgeFeed(self._pilot, sink, case.fixes, HOME, GEOID_M, self._seed)
+        submit = self._guarded(self._bridge, config)
+        self._feed = BridgeFeed(self._pilot, submit, case.fixes, HOME, GEOID_M, self._seed)
         self._stack.callback(self._feed.close)
 
-    def _guarded(self, bridge: Bridge, config: BridgeConfig) -> FixSink:
+    def _guarded(self, bridge: Bridge, config: BridgeConfig) -> Callable[[VisionFix], None]:
         """Where fixes go: the bridge, or the integrity monitor before the bridge if the scenario
         enables the monitor. The monitor gets no video frames here.
         """
         if not self._case.integrity_monitor.enabled:
-            return bridge
+            return bridge.submit
         injection = config.injection
         limits = IntegrityLimits(
             injection.alert_limit_m,
@@ -151,7 +152,7 @@ class _CaseFlight:
         integrity_monitor = IntegrityMonitor(self._case.integrity_monitor, limits, bridge)
         integrity_monitor.start()
         self._stack.callback(integrity_monitor.stop)
-        return integrity_monitor
+        return integrity_monitor.submit
 
     def _take_off(self) -> None:
         self._pilot.wait_ready()
