@@ -88,9 +88,9 @@ def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Se
     return Sequence(paths, times if is_timed else assumed, whole, flight.camera.camera, is_timed)
 
 
-def load_sequence(folder: Path, frame: LocalFrame, name: str | None = None) -> Sequence:
+def load_sequence(folder: Path, frame: LocalFrame) -> Sequence:
     """Read a sequence folder (`read_sequence`) as a `Sequence` in a map's frame."""
-    return sequence_of(read_sequence(folder, name), frame, 0.0)
+    return sequence_of(read_sequence(folder), frame, 0.0)
 
 
 def _telemetry(row: PoseRow, time_ns: int | None) -> Telemetry:

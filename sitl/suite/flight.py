@@ -33,6 +33,7 @@ _NEAR_M = 3.0
 _STEP_S = 0.1
 _LONGEST_S = 240.0
 _ARMING_TRIES = 3
+_PACE_S = 10.0
 
 
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
@@ -266,29 +267,29 @@ class _CaseFlight:
                 record.errors.append((at_s, north, east))
 
 
-def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:
-    """Lowest ratio of simulated to real time over any span_s seconds.
+def slowest_pace(ticks: Sequence[tuple[float, float]]) -> float:
+    """Lowest ratio of simulated to real time over any ten seconds.
 
     ticks: (real time s, vehicle's time s) in order. Spans over a reboot, where the vehicle's time
     runs back, are skipped.
     """
     paces, first = [1.0], 0
     for due, own in ticks:
-        while due - ticks[first][0] > span_s:
+        while due - ticks[first][0] > _PACE_S:
             first += 1
         elapsed = due - ticks[first][0]
-        if elapsed > 0.9 * span_s and own > ticks[first][1]:
+        if elapsed > 0.9 * _PACE_S and own > ticks[first][1]:
             paces.append((own - ticks[first][1]) / elapsed)
     return min(paces)
 
 
-def longest_stall(ticks: Sequence[tuple[float, float]], span_s: float = 1.0) -> float:
-    """Largest time (s) that the simulated vehicle lost against real time within any span_s seconds.
-    ticks: as for `slowest_pace`.
+def longest_stall(ticks: Sequence[tuple[float, float]]) -> float:
+    """Largest time (s) that the simulated vehicle lost against real time within any second. ticks:
+    as for `slowest_pace`.
     """
     worst, first = 0.0, 0
     for due, own in ticks:
-        while due - ticks[first][0] > span_s:
+        while due - ticks[first][0] > 1.0:
             first += 1
         if own >= ticks[first][1]:
             worst = max(worst, (due - ticks[first][0]) - (own - ticks[first][1]))
