@@ -16,7 +16,6 @@ import numpy as np
 
 from companion.geometry import (
     GIMBAL_FROM_CAMERA,
-    ned_from_world,
     world_from_camera,
 )
 from companion.targets.detections import CLICKED
@@ -73,7 +72,7 @@ def vision_fix(
         world_from_body = pose.rotation @ camera_on_body(attitude, gimbal).T
         body, arm_variance = body - world_from_body @ arm, 0.0
     position = frame.position(body)
-    to_ned = ned_from_world(frame, position)
+    to_ned = frame.ned_from_enu(position)
     covariance = to_ned @ estimate.covariance[:3, :3] @ to_ned.T + np.eye(3) * arm_variance
     return VisionFix(
         time_ns=estimate.exposure_time_ns,
@@ -135,7 +134,7 @@ def vehicle_prior(
     frame = extrinsics.frame
     position = Geodetic(place[0], place[1], place[2] + extrinsics.geoid_separation_m)
     body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
-    to_ned = ned_from_world(frame, position)
+    to_ned = frame.ned_from_enu(position)
     velocity: Array | None = None
     if state.local_velocity_ned is not None:
         velocity = to_ned.T @ np.array(state.local_velocity_ned)
@@ -190,7 +189,7 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
     """
     pose, camera = estimate.world_from_camera, estimate.camera
     position = frame.position(pose.translation)
-    ned_from_camera = ned_from_world(frame, position) @ pose.rotation
+    ned_from_camera = frame.ned_from_enu(position) @ pose.rotation
     eye, direction = ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0))
     distance = float(cast(eye, direction[None, :]).distances[0])
     seen = frame.position(eye + distance * direction) if math.isfinite(distance) else None

@@ -14,7 +14,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from localizer.geometry.geo import BODY_FROM_CAMERA, NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.geometry.geo import BODY_FROM_CAMERA, NED_FROM_ENU
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 
 GIMBAL_FROM_CAMERA = BODY_FROM_CAMERA
@@ -69,13 +69,6 @@ class Mount:
         return cls(matrix_from_euler(*angles), np.asarray(lever_arm_m, dtype=np.float64))
 
 
-def ned_from_world(frame: LocalFrame, position: Geodetic) -> Array:
-    """Rotation (3, 3) from the map's ENU axes to NED at `position` (0.5 arcmin per km apart)."""
-    local = LocalFrame(position).ecef_from_enu.rotation
-    ned_from_map: Array = NED_FROM_ENU @ local.T @ frame.ecef_from_enu.rotation
-    return ned_from_map
-
-
 def heading(ned_from_body: Array) -> float:
     """Yaw (rad, from true north, clockwise) of a body attitude (3, 3)."""
     return float(np.arctan2(ned_from_body[1, 0], ned_from_body[0, 0]))
@@ -108,7 +101,7 @@ def world_from_camera(
     """The camera's pose. position: (3,) of the vehicle, world metres; ned_from_body,
     ned_from_camera: (3, 3) attitudes; lever_arm_m: (3,) autopilot to camera, body axes.
 
-    ned_from_world: from the function of that name; by default as at the map's origin.
+    ned_from_world: `LocalFrame.ned_from_enu`; by default as at the map's origin.
     """
     arm = ned_from_world.T @ ned_from_body @ np.asarray(lever_arm_m, dtype=np.float64)
     centre = np.asarray(position, dtype=np.float64) + arm

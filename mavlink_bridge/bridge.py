@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
@@ -90,12 +88,7 @@ class Bridge:
                 notifier.report(alert(AlertId.TLOG_INCOMPLETE, why=Name(why)))
 
             self._recorder = TlogRecorder(config.tlog, incomplete)
-        self._tracker = VehicleTracker(
-            config.system_id,
-            _mount(config),
-            config.camera.mount == "fixed",
-            (config.camera.gimbal_component, config.camera.gimbal_device),
-        )
+        self._tracker = VehicleTracker(config)
         enable = _enable(config, notifier)
         self._shared = shared = Shared(
             config,
@@ -417,12 +410,3 @@ def _enable(config: BridgeConfig, notifier: StatusNotifier) -> InjectionEnable |
     file = config.state_file
     memory = None if file is None else InjectionEnableMemory(file)
     return InjectionEnable(config.rc, notifier.report, memory)
-
-
-def _mount(config: BridgeConfig) -> quat.Quaternion:
-    camera = config.camera
-    return quat.from_euler(
-        math.radians(camera.mount_roll_deg),
-        math.radians(camera.mount_pitch_deg),
-        math.radians(camera.mount_yaw_deg),
-    )

@@ -94,7 +94,7 @@ class FlightControllerEnd:
 
     def shadow_score(self, now_ns: int) -> ShadowScore:
         """Comparison of vision with GNSS over the two minutes before now_ns."""
-        return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
+        return self.outcome.shadow.score(now_ns, self.sender.injector.guard.refused_rad)
 
     def on_gnss(self, now_ns: int) -> bool | None:
         """Whether the EKF takes its position from GNSS; None if its source set is unknown. Fixes
@@ -148,7 +148,7 @@ class FlightControllerEnd:
         result.update({f"rx_{k}": v for k, v in dict(self._streams.counts).items()})
         result["inject_reason"] = "" if injector.reason is None else injector.reason.id.value
         result["reset_counter"] = injector.reset_counter
-        yaw = injector.yaw_difference_rad
+        yaw = injector.guard.difference_rad
         result["yaw_difference_deg"] = None if yaw is None else math.degrees(yaw)
         result["fix_latency_ms"] = injector.latency.median_ms
         trip = clock.round_trip_ns

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from mavlink_bridge.alerts.alert import Alert, AlertKey
 
 _RELAPSE_NS = 8_000_000_000
+_LONGEST_NS = 60_000_000_000
+_MOST_EACH = 4
 
 
 class Hysteresis:
@@ -16,9 +18,8 @@ class Hysteresis:
     doubles the wait. A problem that recurs during the wait is not reported again.
     """
 
-    def __init__(self, wait_s: float = 1.5, longest_s: float = 60.0) -> None:
+    def __init__(self, wait_s: float = 1.5) -> None:
         self._shortest_ns = self._wait_ns = int(wait_s * 1e9)
-        self._longest_ns = int(longest_s * 1e9)
         self._bad_ns: int | None = None
         self._over_ns: int | None = None
 
@@ -27,7 +28,7 @@ class Hysteresis:
         if bad:
             if self._over_ns is not None:
                 relapsed = now_ns - self._over_ns < _RELAPSE_NS + 2 * self._wait_ns
-                longer_ns = min(2 * self._wait_ns, self._longest_ns)
+                longer_ns = min(2 * self._wait_ns, _LONGEST_NS)
                 self._wait_ns = longer_ns if relapsed else self._shortest_ns
                 self._over_ns = None
             self._bad_ns = now_ns
@@ -74,10 +75,10 @@ class StatusNotifier:
         if news is not None and (problem is not None or is_known):
             self.report(news)
 
-    def notify_each(self, topic: str, problem: Alert, most: int = 4) -> None:
-        """Report each problem of a topic once, and `most` of them: a forger may use many names."""
+    def notify_each(self, topic: str, problem: Alert) -> None:
+        """Report each problem of a topic once, and four of them: a forger may use many names."""
         reported = self._each.setdefault(topic, set())
-        if problem.key not in reported and len(reported) < most:
+        if problem.key not in reported and len(reported) < _MOST_EACH:
             reported.add(problem.key)
             self.report(problem)
 

@@ -89,6 +89,9 @@ def main(arguments: Sequence[str]) -> int:
     """Run all parts with pytest's arguments; pytest's exit code, or mypy's if that alone failed."""
     with tempfile.TemporaryDirectory(prefix="tests-") as shared:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
+        if common.pop("PYTHONDONTWRITEBYTECODE", ""):
+            # Each of some hundred processes would compile all its modules, 2 to 20 s of processor.
+            common["PYTHONPYCACHEPREFIX"] = str(Path(shared, "bytecode").resolve())
         crowded = common | _ONE_CORE
         with (
             _beside(_MYPY, common) as types,

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from companion.calibrate import unknowns as u
 from companion.calibrate.pictures import Parts
-from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
+from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, so3_exp, so3_log
-from mavlink_bridge.messages import Attitude, GimbalAttitude
+from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
 @dataclass(frozen=True)
@@ -139,22 +138,6 @@ _STEP_S = 0.02
 OFFSETS_S: Array = np.arange(-REACH_S, REACH_S + 1e-9, _STEP_S)
 
 
-class AutopilotRecord(Protocol):
-    """A record's telemetry at any time; None if unknown."""
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """The vehicle's attitude at a CLOCK_MONOTONIC time."""
-        ...
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time."""
-        ...
-
-    def global_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude AMSL at a time."""
-        ...
-
-
 @dataclass(frozen=True)
 class AutopilotWindow:
     """Autopilot data around one timestamp, at T times `OFFSETS_S` from it; NaN if unknown.
@@ -187,7 +170,7 @@ class AutopilotWindow:
 
 
 def autopilot_window_at(
-    autopilot: AutopilotRecord, time_ns: int, frame: LocalFrame, geoid_m: float, mount: Array
+    autopilot: VehicleTracker, time_ns: int, frame: LocalFrame, geoid_m: float, mount: Array
 ) -> AutopilotWindow | None:
     """The window around a timestamp; None if attitude or gimbal is unknown at one of its times.
 
@@ -202,10 +185,10 @@ def autopilot_window_at(
         if attitude is None or gimbal is None:
             return None
         if where is None:
-            enu, to_ned = np.full(3, np.nan), ned_from_world(frame, frame.origin)
+            enu, to_ned = np.full(3, np.nan), frame.ned_from_enu(frame.origin)
         else:
             enu = np.asarray(frame.enu_from_geodetic(where[0], where[1], where[2] + geoid_m))
-            to_ned = ned_from_world(frame, frame.position(enu))
+            to_ned = frame.ned_from_enu(frame.position(enu))
         camera.append(to_ned.T @ matrix_from_quaternion(gimbal.quaternion) @ mount.T)
         body.append(to_ned.T @ matrix_from_quaternion(attitude.quaternion))
         place.append(enu)

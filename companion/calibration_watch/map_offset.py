@@ -76,12 +76,10 @@ def estimate(blocks: Array, bias_m: float) -> MapOffset:
 
 
 class MapOffsetEstimator:
-    """Estimates the map offset. As a check of fixes (`FixInjection.add_check`) it returns them
-    unchanged or shifted.
+    """Estimates the map offset from fixes, and corrects fixes by it.
 
-    It runs before the other checks, so that they compare the corrected fix with GNSS. It keeps its
-    estimate when GNSS is lost. policy: "tell" changes no fix. gnss_is_ours: whether the vehicle's
-    GNSS is our own GPS_INPUT, which is no evidence.
+    It keeps its estimate when GNSS is lost. policy: "tell" if `corrected` is not used.
+    gnss_is_ours: whether the vehicle's GNSS is our own GPS_INPUT, which is no evidence.
     """
 
     def __init__(
@@ -126,15 +124,14 @@ class MapOffsetEstimator:
             "applied_east_m": float(applied[1]),
         }
 
-    def check(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
-        """Add a fix, to be compared with GNSS 0.7 s later (only while TRACKING); return it, shifted
-        if the policy is "apply" and the offset significant. seen: its estimate.
+    def add_fix(self, seen: PoseEstimate, fix: VisionFix) -> None:
+        """Add an uncorrected fix, to be compared with GNSS 0.7 s later (only while TRACKING). seen:
+        its estimate.
         """
         if seen.state is TrackingState.TRACKING and not self._gnss_is_ours:
             self._waiting.append(fix)
         while self._waiting and fix.time_ns - self._waiting[0].time_ns >= _WAITS_NS:
             self._learn(self._waiting.popleft())
-        return self._shifted(fix) if self._policy == "apply" else fix
 
     def _learn(self, fix: VisionFix) -> None:
         place = self._vehicle.gnss_place_at(fix.time_ns)
@@ -177,8 +174,10 @@ class MapOffsetEstimator:
             f" m, {shift.blocks} blocks",
         )
 
-    def _shifted(self, fix: VisionFix) -> VisionFix:
-        """The fix corrected by the applied offset, which is changed slowly to avoid jumps."""
+    def corrected(self, fix: VisionFix) -> VisionFix:
+        """The fix corrected by the applied offset, which follows a significant estimate slowly, to
+        avoid jumps.
+        """
         shift = self._shift
         usable = shift is not None and shift.significant and math.hypot(*shift.ne_m) <= _LARGEST_M
         if shift is not None and usable:

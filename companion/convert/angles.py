@@ -16,7 +16,6 @@ from companion.geometry import (
     GimbalFrame,
     Mount,
     camera_attitude,
-    ned_from_world,
     world_from_camera,
 )
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -54,7 +53,7 @@ def pose_of_autopilot(angles: AutopilotAngles, frame: LocalFrame) -> Pose:
         body,
         camera_attitude(body, gimbal, Mount.from_degrees()),
         np.zeros(3),
-        ned_from_world(frame, p),
+        frame.ned_from_enu(p),
     )
 
 
@@ -73,7 +72,7 @@ def autopilot_of_pose(
 
 def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Degrees:
     """Gimbal angles of a pose relative to north and the horizon, as in DJI's XMP."""
-    to_ned = ned_from_world(frame, frame.position(pose.translation))
+    to_ned = frame.ned_from_enu(frame.position(pose.translation))
     return angles_of_matrix(to_ned @ pose.rotation @ GIMBAL_FROM_CAMERA.T)
 
 

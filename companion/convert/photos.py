@@ -14,7 +14,6 @@ from typing import Literal
 
 from companion.convert.angles import gimbal_of_pose
 from companion.errors import FootageError
-from companion.geometry import ned_from_world
 from companion.recorded.flight import Datum
 from companion.recorded.photo_tags import PhotoTags, read_photo_tags
 from localizer.errors import GeoreferenceError, PoseFileError
@@ -185,5 +184,5 @@ def _pose(tags: PhotoTags, frame: LocalFrame, lift_m: float) -> StampedPose:
     except (ValueError, GeoreferenceError) as error:
         raise PoseFileError(f"{path}: {error}") from error
     place = frame.enu_from_geodetic(at.latitude_deg, at.longitude_deg, height_m)
-    rotation = ned_from_world(frame, position).T @ said.view.ned_from_camera
+    rotation = frame.ned_from_enu(position).T @ said.view.ned_from_camera
     return StampedPose(path.name, Pose(rotation, place))

@@ -15,9 +15,9 @@ from typing import Any
 
 from companion.config import CompanionConfig
 from companion.errors import CompanionError
+from companion.flight.channels import Feed
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly, Component
-from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
 from companion.flight.recorder import RecordKeeper
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor

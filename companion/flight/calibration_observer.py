@@ -8,7 +8,6 @@ import numpy as np
 
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.conversions import CameraExtrinsics
-from companion.geometry import ned_from_world
 from localizer.types import Float32, PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.messages import VisionFix
 
@@ -46,7 +45,7 @@ class CalibrationObserver:
             fix.time_ns,
             (fix.latitude_deg, fix.longitude_deg, fix.height_m),
             fix.horizontal_sigma_m,
-            ned_from_world(frame, frame.position(pose.translation)) @ pose.rotation,
+            frame.ned_from_enu(frame.position(pose.translation)) @ pose.rotation,
             depth_m,
             estimate.camera.horizontal_fov_deg,
         )

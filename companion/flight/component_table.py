@@ -22,8 +22,8 @@ from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics, target_report
 from companion.errors import ConfigError
 from companion.flight.calibration_observer import CalibrationObserver
+from companion.flight.channels import Feed
 from companion.flight.components import Assembly, Component
-from companion.flight.feed import Feed
 from companion.flight.health import HealthInputs, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
@@ -347,7 +347,10 @@ def _map_shift(context: Assembly) -> MapOffsetEstimator:
         context.channels.events.send,
         gnss_is_ours=injection.message == "gps_input",
     )
-    context[FixInjection].add_check(shift.check)
+    fixes = context[FixInjection]
+    fixes.add_observer(lambda estimate, _, fix: shift.add_fix(estimate, fix))
+    if injection.map_shift == "apply":
+        fixes.add_check(shift.corrected)  # first, so that the others compare it with GNSS
     return shift
 
 
@@ -366,7 +369,7 @@ def _integrity_monitor(context: Assembly) -> IntegrityMonitor:
     integrity_monitor = IntegrityMonitor(
         watched, limits, context[Bridge], memory, context.clock, track
     )
-    context[FixInjection].add_check(lambda _, fix: integrity_monitor.check(fix))
+    context[FixInjection].add_check(integrity_monitor.check)
     context.channels.frames.subscribe(
         lambda f: integrity_monitor.add_frame(f.exposure_time_ns, f.image)
     )

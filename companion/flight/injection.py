@@ -18,7 +18,7 @@ from mavlink_bridge.messages import VisionFix
 
 _log = logging.getLogger(__name__)
 
-FixCheck = Callable[[PoseEstimate, VisionFix], VisionFix | None]
+FixCheck = Callable[[VisionFix], VisionFix | None]
 """Checks a fix before injection. Returns the fix, perhaps with another covariance; None holds it.
 It is called on the localization thread and returns at once. If it raises an exception, the fix is
 held and an alert is raised.
@@ -83,23 +83,24 @@ class FixInjection:
             self._bridge.gimbal_at(time_ns),
             self._jumps,
         )
-        checked = self._checked(estimate, fix)
+        checked = self._checked(fix)
         if checked is not None:
             self._bridge.submit(checked)
         for observer in self._observers:
             observer(estimate, bundle, fix)
 
-    def _checked(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:
+    def _checked(self, fix: VisionFix) -> VisionFix | None:
         """The fix after all checks; None if one holds it."""
+        checked: VisionFix | None = fix
         failed = False
         try:
             for check in self._checks:
-                fix = check(estimate, fix) if fix is not None else None
+                checked = check(checked) if checked is not None else None
         except Exception:  # a position that nobody checked would be believed unwarned
             if not self._checks_failed.raised:
                 _log.exception("a fix could not be checked")
-            failed, fix = True, None
-        alert = self._checks_failed.update(estimate.exposure_time_ns, CheckResult(failed))
+            failed, checked = True, None
+        alert = self._checks_failed.update(fix.time_ns, CheckResult(failed))
         if alert is not None:
             self._bridge.report_alert(alert)
-        return fix
+        return checked

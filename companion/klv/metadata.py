@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
+from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.klv import local_set as tag
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, euler_from_matrix
@@ -59,7 +59,7 @@ def frame_fields(
     if scene.mission:
         fields[tag.MISSION] = scene.mission
     if ned_from_body is not None:
-        ned_from_camera = ned_from_world(scene.frame, position) @ pose.rotation
+        ned_from_camera = scene.frame.ned_from_enu(position) @ pose.rotation
         fields |= _attitude(ned_from_body, ned_from_camera)
     fields |= _footprint(estimate, scene)
     if target is not None:

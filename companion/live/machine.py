@@ -40,10 +40,10 @@ class MachineLoad:
         return times.user + times.system
 
 
-def warmest_c(zones: Path = _ZONES) -> float | None:
+def warmest_c() -> float | None:
     """Temperature of the warmest thermal zone, degrees Celsius; None if none can be read."""
     found = []
-    for path in zones.glob("thermal_zone*/temp"):
+    for path in _ZONES.glob("thermal_zone*/temp"):
         try:
             found.append(int(path.read_text()) / 1000.0)
         except (OSError, ValueError):

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from companion.recorded.flight import LogBeside
 from companion.sources.zoom import ZoomTable
-from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.tlog import read_tlog
 from mavlink_bridge.messages import VehicleState
@@ -20,15 +17,8 @@ class RecordedAutopilot(VehicleTracker):
     """
 
     def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
-        c = bridge.camera
-        mount = quat.from_euler(*np.radians([c.mount_roll_deg, c.mount_pitch_deg, c.mount_yaw_deg]))
+        super().__init__(bridge)
         self._now_ns = start_ns
-        super().__init__(
-            bridge.system_id,
-            mount,
-            bridge.camera.mount == "fixed",
-            (bridge.camera.gimbal_component, bridge.camera.gimbal_device),
-        )
         dated = ((utc - log.ahead_ns, m) for utc, m in read_tlog(log.path))
         # A .tlog is appended to: earlier flights may stand before this one.
         self._messages = (item for item in dated if item[0] >= start_ns)

@@ -309,7 +309,7 @@ class _Player:
             if self._counts.first_go_s is None:
                 self._counts.first_go_s = self._since_s()
 
-    def _passed(self, _: PoseEstimate, fix: Any) -> Any:
+    def _passed(self, fix: Any) -> Any:
         self._counts.passed += 1
         return fix
 

@@ -17,7 +17,6 @@ from companion.geometry import (
     GimbalFrame,
     Mount,
     camera_attitude,
-    ned_from_world,
     world_from_camera,
 )
 from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
@@ -141,7 +140,7 @@ def legs_of(
 
 def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
     """The camera's world pose at a sample, for a level vehicle that flies along its path."""
-    to_ned = ned_from_world(cache.frame, cache.frame.position(sample.position))
+    to_ned = cache.frame.ned_from_enu(cache.frame.position(sample.position))
     body = matrix_from_euler(0.0, 0.0, float(np.radians(sample.heading_deg)))
     turn = float(np.radians(sample.turn_deg))
     if aim.fixed:

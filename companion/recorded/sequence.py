@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.geometry import ned_from_world
 from companion.recorded.cameras import camera_given
 from companion.recorded.flight import (
     HEADING_DEG,
@@ -89,9 +88,9 @@ def sequence_of(flight: RecordedFlight, frame: LocalFrame, geoid_m: float) -> Se
     return Sequence(paths, times if is_timed else assumed, whole, flight.camera.camera, is_timed)
 
 
-def load_sequence(folder: Path, frame: LocalFrame, name: str | None = None) -> Sequence:
+def load_sequence(folder: Path, frame: LocalFrame) -> Sequence:
     """Read a sequence folder (`read_sequence`) as a `Sequence` in a map's frame."""
-    return sequence_of(read_sequence(folder, name), frame, 0.0)
+    return sequence_of(read_sequence(folder), frame, 0.0)
 
 
 def _telemetry(row: PoseRow, time_ns: int | None) -> Telemetry:
@@ -112,7 +111,7 @@ def _pose(said: Telemetry, frame: LocalFrame, geoid_m: float) -> Pose | None:
         return None
     p = Geodetic(said.position.latitude_deg, said.position.longitude_deg, height)
     centre = np.asarray(frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m))
-    return Pose(ned_from_world(frame, p).T @ said.view.ned_from_camera, centre)
+    return Pose(frame.ned_from_enu(p).T @ said.view.ned_from_camera, centre)
 
 
 def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:

@@ -45,7 +45,7 @@ from companion.sources.datagrams import (
 from companion.sources.misp import misp_time
 from companion.sources.references import DamageTracker, ReferenceTracker
 from companion.sources.sdp import SdpSession
-from companion.sources.timing import ExposureClock, FrameTimestamps
+from companion.sources.timing import ExposureClock
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange, grey_levels
 from localizer.tracking.mailbox import Mailbox
@@ -422,8 +422,8 @@ class LiveVideoSource(FrameSource):
         camera = self._fitted(picture)
         if camera is None:
             return
-        stamps = FrameTimestamps(_pts_ns(picture), misp_time(picture))
-        exposure_ns = clock.exposure_time(stamps, arrival_ns) - self._settings.late_ns
+        exposure_ns = clock.exposure_time(_pts_ns(picture), misp_time(picture), arrival_ns)
+        exposure_ns -= self._settings.late_ns
         _pass_exposure_time(self._taps, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile

@@ -64,14 +64,6 @@ class MinimumLag:
         return sender_ns < self._last_sender or abs(lag - known) > _DISCONTINUITY_NS
 
 
-@dataclass(frozen=True)
-class FrameTimestamps:
-    """Time stamps of a frame; None without. pts_ns: presentation time, unknown epoch."""
-
-    pts_ns: int | None
-    misp: MispTime | None
-
-
 class ExposureClock:
     """Computes exposure times; a new one for each connection. device: a V4L2 device, whose
     presentation times are CLOCK_MONOTONIC.
@@ -87,14 +79,16 @@ class ExposureClock:
         self._excess_ns: int | None = None  # of the smallest lag's times over the exact ones
         self._held = False
 
-    def exposure_time(self, stamps: FrameTimestamps, arrival_ns: int) -> int:
-        """CLOCK_MONOTONIC ns of the exposure of the next frame, which arrived at `arrival_ns`."""
-        if self._device and stamps.pts_ns is not None and _plausible(stamps.pts_ns, arrival_ns):
-            return stamps.pts_ns
-        if stamps.misp is not None and self._timing == "auto":
-            return self._from_misp(stamps.misp, arrival_ns)
-        if stamps.pts_ns is not None:
-            return self._by_pts.map(stamps.pts_ns, arrival_ns)
+    def exposure_time(self, pts_ns: int | None, misp: MispTime | None, arrival_ns: int) -> int:
+        """CLOCK_MONOTONIC ns of the exposure of the next frame, which arrived at `arrival_ns`.
+        pts_ns: presentation time, of unknown epoch; None without, as misp.
+        """
+        if self._device and pts_ns is not None and _plausible(pts_ns, arrival_ns):
+            return pts_ns
+        if misp is not None and self._timing == "auto":
+            return self._from_misp(misp, arrival_ns)
+        if pts_ns is not None:
+            return self._by_pts.map(pts_ns, arrival_ns)
         return arrival_ns - self._by_pts.latency_ns
 
     def _from_misp(self, misp: MispTime, arrival_ns: int) -> int:

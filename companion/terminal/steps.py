@@ -12,20 +12,20 @@ from rich.console import Console
 from rich.markup import escape
 
 Say = Callable[[str], None]
-_SILENT_S = 2.0
+_SILENT_S, _COUNT_EVERY_S, _EVERY_S = 2.0, 5.0, 10.0
 COMPILES = "makes the localizer ready; a first start on a machine compiles its kernels"
 READING = "reads the source"
 
 
 @contextmanager
-def show_steps(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[Say]:
+def show_steps(console: Console) -> Iterator[Say]:
     """Context manager: a callback that shows the present step. In a log each step is a line with
     the seconds since the start.
     """
     if not console.is_terminal:
-        begun_s = clock()
+        begun_s = time.monotonic()
         yield lambda text: console.print(
-            f"{clock() - begun_s:4.0f} s {escape(text)}", highlight=False, soft_wrap=True
+            f"{time.monotonic() - begun_s:4.0f} s {escape(text)}", highlight=False, soft_wrap=True
         )
         return
     with console.status("starting") as status:
@@ -33,9 +33,7 @@ def show_steps(console: Console, clock: Callable[[], float] = time.monotonic) ->
 
 
 @contextmanager
-def show_count(
-    console: Console, what: str, every_s: float = 5.0, begins: str = "begun"
-) -> Iterator[Callable[..., None]]:
+def show_count(console: Console, what: str, begins: str = "begun") -> Iterator[Callable[..., None]]:
     """Context manager for counted work. Gives a callback (done, total), which shows a bar, or in a
     log a line every few seconds. begins: text shown if nothing was counted after two seconds.
     """
@@ -46,7 +44,7 @@ def show_count(
             task = bar.add_task(what, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)
         return
-    lines = _Lines(console, what, every_s, begins)
+    lines = _Lines(console, what, begins)
     timer = threading.Timer(_SILENT_S, lines.begin)
     timer.daemon = True
     timer.start()
@@ -57,7 +55,7 @@ def show_count(
 
 
 @contextmanager
-def show_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[None]:
+def show_work(console: Console, what: str) -> Iterator[None]:
     """Context manager for work that cannot be counted: a spinner, or in a log a line after two
     seconds and then every ten.
     """
@@ -72,7 +70,7 @@ def show_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[No
         while not over.wait(wait_s):
             line = f"{time.monotonic() - begun_s:4.0f} s {what}"
             console.print(line, highlight=False, soft_wrap=True, markup=False)
-            wait_s = every_s
+            wait_s = _EVERY_S
 
     threading.Thread(target=tell, name="progress", daemon=True).start()
     try:
@@ -90,9 +88,8 @@ def tally(show: Callable[..., None], total: int | None = None) -> Callable[..., 
 class _Lines:
     """Log lines of counted work: the first after two seconds, then one every few, and the last."""
 
-    def __init__(self, console: Console, what: str, every_s: float, begins: str) -> None:
-        self._console, self._what = console, what
-        self._every_s, self._begins = every_s, begins
+    def __init__(self, console: Console, what: str, begins: str) -> None:
+        self._console, self._what, self._begins = console, what, begins
         self._begun_s = time.monotonic()
         self._lock = threading.Lock()
         self._printed_s: float | None = None
@@ -108,7 +105,7 @@ class _Lines:
         with self._lock:
             now_s = time.monotonic() - self._begun_s
             is_first = self._printed_s is None and now_s >= _SILENT_S
-            later = self._printed_s is not None and now_s - self._printed_s >= self._every_s
+            later = self._printed_s is not None and now_s - self._printed_s >= _COUNT_EVERY_S
             is_last = done == total and self._printed_s is not None
             if is_first or later or is_last:
                 self._print(f"{done}" if total is None else f"{done} of {total}")

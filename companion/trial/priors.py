@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.errors import FootageError
-from companion.geometry import ned_from_world
 from companion.planning.way import MapHeights
 from companion.recorded.flight import (
     Datum,
@@ -279,7 +278,7 @@ def _prior(
     view = telemetry.view or looking_down(telemetry.course_deg)
     told = telemetry.position
     at = frame.origin if told is None else Geodetic(told.latitude_deg, told.longitude_deg, 0.0)
-    rotation = np.asarray(ned_from_world(frame, at).T @ view.ned_from_camera)
+    rotation = np.asarray(frame.ned_from_enu(at).T @ view.ned_from_camera)
     base = ground_m if ground_m is not None else usual_m
     low, high = (base + c for c in _UNKNOWN_CLEARANCE_M)
     z, sigma, is_known = 0.5 * (low + high), 0.5 * (high - low), False

@@ -63,9 +63,9 @@ class Trial:
                 found[k] = horizontal_m(one.pose, prior.pose)
         return found
 
-    def levels_m(self, config: ProtectionConfig | None = None) -> Array:
+    def levels_m(self) -> Array:
         """(F,) horizontal protection level of accepted positions, m; NaN for others."""
-        config = config or ProtectionConfig()
+        config = ProtectionConfig()
         levels = np.full(len(self.best), np.nan)
         for k, (one, prior) in enumerate(zip(self.best, self.priors, strict=True)):
             if one.accepted and one.covariance is not None:

@@ -107,3 +107,9 @@ class LocalFrame:
         """One ENU point (3,) as a `Geodetic`."""
         lat, lon, h = self.geodetic_from_enu(enu)
         return Geodetic(float(lat), float(lon), float(h))
+
+    def ned_from_enu(self, position: Geodetic) -> Array:
+        """Rotation (3, 3) from this frame's axes to NED at `position` (0.5 arcmin per km apart)."""
+        local = LocalFrame(position).ecef_from_enu.rotation
+        rotation: Array = NED_FROM_ENU @ local.T @ self.ecef_from_enu.rotation
+        return rotation

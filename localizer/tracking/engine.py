@@ -19,9 +19,8 @@ from dataclasses import replace
 
 from localizer.errors import LocalizerError
 from localizer.tracking.engine_health import EngineHealth, HealthCounters
-from localizer.tracking.mailbox import Mailbox
+from localizer.tracking.mailbox import FeaturePrefetcher, Mailbox, PrefetchedFrame
 from localizer.tracking.pipeline import Localizer, stopwatch
-from localizer.tracking.prefetch import FeaturePrefetcher, PrefetchedFrame
 from localizer.types import (
     Frame,
     PoseEstimate,

@@ -16,7 +16,6 @@ from filterpy.kalman import predict as kalman_predict
 from filterpy.kalman import update as kalman_update
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
-from localizer.geometry.shutter import Sweep
 from localizer.integrity.confirmation import DisplacementBetween
 from localizer.types import PosePrior
 
@@ -27,7 +26,6 @@ _MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are r
 _MAX_SIGMA_RAD = float(np.radians(8.0))
 _FULL = 0.99  # of these limits: a prediction that they cut
 _LONGEST_S = 10.0  # a camera's clock that jumped, or a gap that no velocity bridges
-_LEAST_RATE_NS = 15_000_000  # to both sides of an exposure: sensors report every 20 ms
 _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 
 
@@ -182,42 +180,9 @@ class AuxiliarySensors:
     height_at: Callable[[int], float | None] = lambda _time_ns: None
     clearance_at: Callable[[int], float | None] = lambda _time_ns: None
 
-
-class MeasuredMotion:
-    """The motion model with the rotation measured by another sensor where known."""
-
-    def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
-        self._config, self._rotation_at = config, rotation_at
-
-    def predict(self, state: MotionState, time_ns: int) -> MotionState:
-        """`predict` with the rotation that was measured in between, if any."""
-        turn = self._turn(state.time_ns, time_ns)
-        return predict(state, time_ns, self._config, turn)
-
-    def at_frame(self, state: MotionState, time_ns: int) -> MotionState:
-        """The state at a frame's exposure; its motion is unknown if the exposure is earlier."""
-        if time_ns >= state.time_ns:
-            return self.predict(state, time_ns)
-        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
-        turn = self._turn(state.time_ns, time_ns)
-        return reset_motion(state, time_ns, self._config, turn)
-
-    def sweep(self, ahead: MotionState, readout_ms: float) -> Sweep | None:
-        """The camera's motion during the readout of a frame at the state's time; None for a global
-        shutter.
-
-        The rotation comes from the other sensor, if its data surround the exposure; otherwise from
-        the motion model.
-        """
-        if readout_ms <= 0:
-            return None
-        half_ns = max(round(0.5e6 * readout_ms), _LEAST_RATE_NS)
-        turn = self._turn(ahead.time_ns - half_ns, ahead.time_ns + half_ns)
-        rate = ahead.rate if turn is None else so3_log(turn) / (2e-9 * half_ns)
-        return Sweep.of(rate, ahead.velocity, readout_ms)
-
-    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
-        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
+    def turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        """Rotation (3, 3) of the camera between two times, in world axes; None if unknown."""
+        begin, end = self.rotation_at(begin_ns), self.rotation_at(end_ns)
         return end @ begin.T if begin is not None and end is not None else None
 
 

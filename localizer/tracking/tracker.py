@@ -6,13 +6,14 @@ import threading
 from dataclasses import dataclass, field, replace
 
 from localizer.config import LocalizerConfig
+from localizer.geometry.pose import so3_log
 from localizer.geometry.shutter import Sweep
 from localizer.integrity.acceptance import is_acceptable
 from localizer.integrity.confirmation import IndependentEvidence
 from localizer.registration.result import Registration
 from localizer.tracking import motion
 from localizer.tracking.dead_reckoning import DeadReckoning, PropagatedPose, PropagationResult
-from localizer.tracking.motion import AuxiliarySensors, MeasuredMotion, MotionState
+from localizer.tracking.motion import AuxiliarySensors, MotionState
 from localizer.tracking.rejoining import Rejoining
 from localizer.tracking.sensor_fusion import FusedRegistration
 from localizer.tracking.states import RegistrationOutcome, TrackStatus, next_status
@@ -25,6 +26,8 @@ from localizer.types import (
     RegistrationStatus,
     TrackingState,
 )
+
+_LEAST_RATE_NS = 15_000_000  # to both sides of an exposure: sensors report every 20 ms
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,6 @@ class Tracker:
         dead_reckoning: DeadReckoning | None,
     ) -> None:
         self._config = config
-        self._motion = MeasuredMotion(config.motion, sensors.rotation_at)
         self._sensors = sensors
         self._dead_reckoning = dead_reckoning
         self._rejoining = Rejoining()
@@ -77,7 +79,10 @@ class Tracker:
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction; None before the first prior."""
         state = self.state.motion
-        return self._motion.predict(state, time_ns).prior if state else None
+        if state is None:
+            return None
+        turn = self._sensors.turn(state.time_ns, time_ns)
+        return motion.predict(state, time_ns, self._config.motion, turn).prior
 
     def at_frame(self, seen: TrackerState, time_ns: int) -> MotionState | None:
         """The motion of `seen`, extrapolated to a frame's exposure; None before the first prior.
@@ -85,13 +90,26 @@ class Tracker:
         For an exposure before that motion's time (the camera's clock jumped) the pose is kept, its
         sigmas are those of a search, and the velocity is unknown.
         """
-        return self._motion.at_frame(seen.motion, time_ns) if seen.motion is not None else None
+        state = seen.motion
+        if state is None:
+            return None
+        turn = self._sensors.turn(state.time_ns, time_ns)
+        # Back in time its velocity would move the state the wrong way.
+        move = motion.predict if time_ns >= state.time_ns else motion.reset_motion
+        return move(state, time_ns, self._config.motion, turn)
 
     def sweep(self, frame: Frame, ahead: MotionState) -> Sweep | None:
         """The camera's motion while a rolling shutter reads the frame; None for a global shutter.
-        ahead: the motion at the frame's exposure.
+        ahead: the motion at the frame's exposure. The rotation comes from the other sensor, if its
+        data surround the exposure; otherwise from the motion model.
         """
-        return self._motion.sweep(ahead, frame.camera.readout_ms)
+        readout_ms = frame.camera.readout_ms
+        if readout_ms <= 0:
+            return None
+        half_ns = max(round(0.5e6 * readout_ms), _LEAST_RATE_NS)
+        turn = self._sensors.turn(ahead.time_ns - half_ns, ahead.time_ns + half_ns)
+        rate = ahead.rate if turn is None else so3_log(turn) / (2e-9 * half_ns)
+        return Sweep.of(rate, ahead.velocity, readout_ms)
 
     def update(
         self,
@@ -134,17 +152,13 @@ class Tracker:
             moved = motion.start(_restart(result, ahead), self._config.motion)
         self._store(seen, moved, track_status)
         estimate = _estimate(frame, outcome, result, carried, track_status)
-        if estimate.accepted and not bridges:
+        is_fix = estimate.accepted and not bridges
+        if is_fix:
             # Position and tilt err together, from frame to frame again; the turn between two frames
             # is known several times better. The sigmas told stay the registration's: the map errs
             # alike for seconds, which a filter takes for knowledge.
             estimate = replace(estimate, world_from_camera=moved.prior.world_from_camera)
-        if (
-            estimate.accepted
-            and not bridges
-            and self._dead_reckoning is not None
-            and anchors is not None
-        ):
+        if is_fix and self._dead_reckoning is not None and anchors is not None:
             swept = self.sweep(frame, ahead)
             self._dead_reckoning.begin(estimate, query, anchors, moved.velocity, swept)
         return estimate

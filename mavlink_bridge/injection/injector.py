@@ -148,16 +148,9 @@ class Injector:
         self.motion = WithheldMotion()
         self._pace = _FixRate(config.overdue_intervals)
         self._sent_fix_ns = 0
-        self.yaw_difference_rad: float | None = None
-        """The last fix's yaw minus the autopilot's; None while none could be compared."""
         self.reason: Alert | None = alert(AlertId.NO_FIX_YET)
         """Why nothing was sent last; None when it was."""
         self.counters: Counter[str] = Counter()
-
-    @property
-    def refused_yaw_rad(self) -> float | None:
-        """Yaw difference for which the guard blocks injection; None while it does not."""
-        return self.yaw_difference_rad if self.guard.blocked else None
 
     def submit(self, fix: VisionFix, now_ns: int) -> None:
         """Queue a fix that arrived at now_ns. A fix that is late by 3 s, from the future or out of
@@ -227,11 +220,7 @@ class Injector:
     def _take_due(self, now_ns: int, context: InjectionContext) -> None:
         while self._waiting and self._waiting[0].time_ns + self._delay_ns <= now_ns:
             fix = self._waiting.popleft()
-            attitude = context.attitude_at(fix.time_ns)
-            verdict = self.guard.check(fix, attitude)
-            if verdict.difference_rad is not None:
-                self.yaw_difference_rad = verdict.difference_rad
-            if not verdict.accept:
+            if not self.guard.accepts(fix, context.attitude_at(fix.time_ns)):
                 self.counters["fixes_yaw_refused"] += 1
                 continue
             uncertain = fix.by_odometry and fix.horizontal_sigma_m > self._config.max_sigma_m
@@ -268,7 +257,7 @@ class Injector:
         if self._propagator.fix is None and not self.guard.blocked:
             return None
         fill_due = now_ns >= self._fill_due_ns()
-        if (refused := self.refused_yaw_rad) is not None:
+        if (refused := self.guard.refused_rad) is not None:
             self._fresh = None
             degrees = math.degrees(refused)
             reason = alert(AlertId.YAW_MISMATCH, degrees=degrees)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass
 
 from mavlink_bridge.messages import Attitude, VisionFix
 from mavlink_bridge.quaternion import wrap_pi
@@ -26,16 +25,6 @@ _MINIMUM_SAMPLES = 5  # fixes compared: the majority blocks, all release
 _BASELINE_NS = 1_000_000_000
 _RELEASE_SHARE = 0.7
 _BLIND_AFTER = 20  # fixes in a row
-
-
-@dataclass(frozen=True)
-class YawVerdict:
-    """Result of the check of one fix. accept: send it; difference_rad: vision's yaw minus the
-    autopilot's, None if one of them is unknown.
-    """
-
-    accept: bool
-    difference_rad: float | None
 
 
 class YawGuard:
@@ -51,7 +40,14 @@ class YawGuard:
         self._last: deque[bool] = deque(maxlen=_MINIMUM_SAMPLES)
         self._reset_count = 0  # of the fix before
         self.blocked = False
+        self.difference_rad: float | None = None
+        """The last fix's yaw minus the autopilot's; None while none could be compared."""
         self._unchecked_in_a_row = 0
+
+    @property
+    def refused_rad(self) -> float | None:
+        """Yaw difference for which injection is blocked; None while it is not."""
+        return self.difference_rad if self.blocked else None
 
     @property
     def blind(self) -> bool:
@@ -64,18 +60,18 @@ class YawGuard:
         self._last.clear()
         self.blocked = False
 
-    def check(self, fix: VisionFix, autopilot: Attitude | None) -> YawVerdict:
-        """Check one fix, in order of time. autopilot: its attitude at that time, None if unknown. A
-        fix without both yaws passes unless the guard blocks.
+    def accepts(self, fix: VisionFix, autopilot: Attitude | None) -> bool:
+        """Check one fix, in order of time; whether it may be sent. autopilot: its attitude at that
+        time, None if unknown. A fix without both yaws passes unless the guard blocks.
         """
         time_ns, vision_yaw_rad = fix.time_ns, fix.yaw_rad
         reset = fix.reset_count != self._reset_count
         self._reset_count = fix.reset_count
         if autopilot is None or vision_yaw_rad is None:
             self._unchecked_in_a_row += 1
-            return YawVerdict(not self.blocked, None)
+            return not self.blocked
         self._unchecked_in_a_row = 0
-        difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
+        self.difference_rad = difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
         to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)
         good = self._agrees(time_ns, difference, to_gyros, reset)
         self._update_block(good)
@@ -84,7 +80,7 @@ class YawGuard:
             self._accepted.clear()  # what follows is held against this fix, not against the past
         if accept:
             self._accepted.append((time_ns, to_gyros, difference))
-        return YawVerdict(accept, difference)
+        return accept
 
     def _update_block(self, good: bool) -> None:
         """Add a result; block or release by the last ones."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import BootClock
 from mavlink_bridge.messages import (
     Attitude,
@@ -30,27 +32,20 @@ _OLD_NS = 2_000_000_000
 
 class VehicleTracker:
     """Processes one vehicle's messages. `accepts`, `handle` and `timesync` run in the link's
-    thread; other methods in any.
-
-    system_id: of the vehicle, None: the first heard. mount: quaternion, camera to gimbal or body.
-    fixed_camera: mounted on the airframe, so that no gimbal's angles are used. gimbal: component
-    and gimbal_device_id whose angles are used, 0 for any.
+    thread; other methods in any. config: says which vehicle (without `system_id` the first that is
+    heard), which gimbal, and how the camera is mounted.
     """
 
-    def __init__(
-        self,
-        system_id: int | None,
-        mount: quat.Quaternion,
-        fixed_camera: bool,
-        gimbal: tuple[int, int] = (0, 0),
-    ) -> None:
+    def __init__(self, config: BridgeConfig) -> None:
+        camera = config.camera
         self.clock = BootClock()
         self._lock = threading.Lock()
-        self._readings = VehicleReadings(gimbal)
+        self._readings = VehicleReadings((camera.gimbal_component, camera.gimbal_device))
         self.arming = self._readings.arming
-        self._wanted_id = system_id
-        self._mount = mount
-        self._fixed = fixed_camera
+        self._wanted_id = config.system_id
+        angles = (camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg)
+        self._mount = quat.from_euler(*map(math.radians, angles))
+        self._fixed = camera.mount == "fixed"
         self.ignored = 0
 
     def snapshot(self, now_ns: int) -> VehicleState:

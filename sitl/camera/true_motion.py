@@ -12,7 +12,6 @@ from companion.geometry import (
     GimbalAngles,
     Mount,
     camera_attitude,
-    ned_from_world,
     world_from_camera,
 )
 from localizer.geometry.geo import LocalFrame
@@ -35,7 +34,7 @@ class TruthSample:
 
 def camera_pose(sample: TruthSample, frame: LocalFrame, mount: Mount) -> Pose:
     """The camera's true pose world_from_camera from the vehicle's. frame: the map's ENU."""
-    to_ned = ned_from_world(frame, frame.position(sample.position))
+    to_ned = frame.ned_from_enu(frame.position(sample.position))
     body = matrix_from_quaternion(sample.body)
     attitude = camera_attitude(body, sample.gimbal, mount)
     return world_from_camera(sample.position, body, attitude, mount.lever_arm_m, to_ned)

@@ -15,15 +15,14 @@ LINE_EVERY_S = 10.0
 class LogProgress:
     """Prints a line when the phase changes, and every ten seconds."""
 
-    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        self._console, self._clock = console, clock
-        self._begun = clock()
+    def __init__(self, console: Console) -> None:
+        self._console, self._begun = console, time.monotonic()
         self._printed_s = 0.0
         self._phase: str | None = None
 
     def __call__(self, phase: str, share: float) -> None:
         """Report a phase; share: how much of the whole work is done, 0 to 1."""
-        now_s = self._clock() - self._begun
+        now_s = time.monotonic() - self._begun
         if phase == self._phase and now_s - self._printed_s < LINE_EVERY_S:
             return
         self._phase, self._printed_s = phase, now_s

@@ -20,6 +20,7 @@ from sitl.ground.mission_client import MissionClient
 from sitl.ground.vehicle_record import AUTOPILOT, MODES, PX4_MODES, VEHICLE
 
 _GUIDED_POSITION = 0xDF8  # position only
+_READY_S = 120.0  # of a vehicle on the ground, and of a take-off
 _SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 
 
@@ -60,16 +61,16 @@ class Pilot:
         finally:
             self.link.set_speed(normal)
 
-    def wait_ready(self, timeout_s: float = 120.0) -> None:
+    def wait_ready(self) -> None:
         """Wait for an EKF position, change to GUIDED, wait for the pre-arm checks there, and read
-        the EKF origin. `PilotError` after timeout_s each.
+        the EKF origin. `PilotError` after 120 s each.
         """
-        self.link.wait(self._has_position, timeout_s, "an EKF position")
+        self.link.wait(self._has_position, _READY_S, "an EKF position")
         self.set_mode("GUIDED")
         bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
         self.link.wait(
             lambda: bool(self.record.latest["SYS_STATUS"].onboard_control_sensors_health & bit),
-            timeout_s,
+            _READY_S,
             "the pre-arm checks",
         )
         self.read_origin()
@@ -105,7 +106,7 @@ class Pilot:
         """Reboot the disarmed autopilot; the caller then needs a new connection."""
         self.link.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
 
-    def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
+    def takeoff(self, height_m: float) -> None:
         """Take off, armed in GUIDED; returns at a true height above ground of height_m - 2 m."""
         ground = self.record.truth.altitude_m
         self._ground_m = ground
@@ -113,7 +114,7 @@ class Pilot:
         self.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height)
         self.link.wait(
             lambda: self.record.truth.altitude_m > ground + height_m - 2.0,
-            timeout_s,
+            _READY_S,
             f"the take-off to {height_m:g} m",
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,6 +12,7 @@ from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.messages import VisionFix
 from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
@@ -19,7 +20,7 @@ from sitl.suite.case import Case, CaseEvent
 from sitl.suite.doctor import run_doctor
 from sitl.suite.ramp import RunningRamp
 from sitl.suite.record import CaseRecord, Text, VehicleSample
-from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink
+from sitl.suite.simulated_localizer import BridgeFeed, FixModel
 from sitl.vehicles.launch import VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
 
@@ -32,6 +33,7 @@ _NEAR_M = 3.0
 _STEP_S = 0.1
 _LONGEST_S = 240.0
 _ARMING_TRIES = 3
+_PACE_S = 10.0
 
 
 def fly(case: Case, kind: VehicleKind, seed: int = 0) -> CaseRecord:
@@ -132,16 +134,16 @@ class _CaseFlight:
         self._bridge = Bridge(config, GEOID_M)
         self._bridge.start()
         self._stack.callback(self._bridge.stop)
-        sink = self._guarded(self._bridge, config)
-        self._feed = BridgeFeed(self._pilot, sink, case.fixes, HOME, GEOID_M, self._seed)
+        submit = self._guarded(self._bridge, config)
+        self._feed = BridgeFeed(self._pilot, submit, case.fixes, HOME, GEOID_M, self._seed)
         self._stack.callback(self._feed.close)
 
-    def _guarded(self, bridge: Bridge, config: BridgeConfig) -> FixSink:
+    def _guarded(self, bridge: Bridge, config: BridgeConfig) -> Callable[[VisionFix], None]:
         """Where fixes go: the bridge, or the integrity monitor before the bridge if the scenario
         enables the monitor. The monitor gets no video frames here.
         """
         if not self._case.integrity_monitor.enabled:
-            return bridge
+            return bridge.submit
         injection = config.injection
         limits = IntegrityLimits(
             injection.alert_limit_m,
@@ -151,7 +153,7 @@ class _CaseFlight:
         integrity_monitor = IntegrityMonitor(self._case.integrity_monitor, limits, bridge)
         integrity_monitor.start()
         self._stack.callback(integrity_monitor.stop)
-        return integrity_monitor
+        return integrity_monitor.submit
 
     def _take_off(self) -> None:
         self._pilot.wait_ready()
@@ -265,29 +267,29 @@ class _CaseFlight:
                 record.errors.append((at_s, north, east))
 
 
-def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:
-    """Lowest ratio of simulated to real time over any span_s seconds.
+def slowest_pace(ticks: Sequence[tuple[float, float]]) -> float:
+    """Lowest ratio of simulated to real time over any ten seconds.
 
     ticks: (real time s, vehicle's time s) in order. Spans over a reboot, where the vehicle's time
     runs back, are skipped.
     """
     paces, first = [1.0], 0
     for due, own in ticks:
-        while due - ticks[first][0] > span_s:
+        while due - ticks[first][0] > _PACE_S:
             first += 1
         elapsed = due - ticks[first][0]
-        if elapsed > 0.9 * span_s and own > ticks[first][1]:
+        if elapsed > 0.9 * _PACE_S and own > ticks[first][1]:
             paces.append((own - ticks[first][1]) / elapsed)
     return min(paces)
 
 
-def longest_stall(ticks: Sequence[tuple[float, float]], span_s: float = 1.0) -> float:
-    """Largest time (s) that the simulated vehicle lost against real time within any span_s seconds.
-    ticks: as for `slowest_pace`.
+def longest_stall(ticks: Sequence[tuple[float, float]]) -> float:
+    """Largest time (s) that the simulated vehicle lost against real time within any second. ticks:
+    as for `slowest_pace`.
     """
     worst, first = 0.0, 0
     for due, own in ticks:
-        while due - ticks[first][0] > span_s:
+        while due - ticks[first][0] > 1.0:
             first += 1
         if own >= ticks[first][1]:
             worst = max(worst, (due - ticks[first][0]) - (own - ticks[first][1]))

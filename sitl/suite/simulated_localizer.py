@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -54,32 +55,24 @@ class FixModel(BaseModel):
     odometry_scale: float | None = Field(None, gt=-0.5, lt=1.0)
 
 
-class FixSink(Protocol):
-    """Receives fixes: the bridge, or the integrity monitor before the bridge."""
-
-    def submit(self, fix: VisionFix) -> None:
-        """Take one fix for injection. Never blocks."""
-        ...
-
-
 class BridgeFeed:
     """Submits fixes in a thread, in real time, from when it is made until it is closed.
 
-    pilot: gives the truth; may be replaced. home: the map's origin, altitude AMSL; geoid_m: the
-    map's geoid separation there.
+    pilot: gives the truth; may be replaced. submit: takes each fix and never blocks. home: the
+    map's origin, altitude AMSL; geoid_m: the map's geoid separation there.
     """
 
     def __init__(
         self,
         pilot: Pilot,
-        sink: FixSink,
+        submit: Callable[[VisionFix], None],
         model: FixModel,
         home: Location,
         geoid_m: float,
         seed: int = 1,
     ) -> None:
         self.pilot = pilot
-        self._sink, self._home, self._geoid_m = sink, home, geoid_m
+        self._submit, self._home, self._geoid_m = submit, home, geoid_m
         self._model, self._resets = model, 0
         self._hung: Truth | None = None
         self._left: Vector | None = None  # where the map ended
@@ -111,7 +104,7 @@ class BridgeFeed:
                 return
             truth = self.pilot.record.truth_at(int(exposure * 1e9))
             if truth is not None and not model.silent:
-                self._sink.submit(self._fix(truth))
+                self._submit(self._fix(truth))
 
     def _latency_s(self, model: FixModel) -> float:
         """Random latency from exposure to submission of a fix."""

@@ -49,11 +49,11 @@ GPS_OFF: dict[str, float] = {"SIM_GPS1_ENABLE": 0}
 _CHECK_ALL_BUT_VISION = ((1 << 20) - 2) & ~(1 << 18)
 
 
-def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
+def vision_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
     """Parameters: start on GNSS (source set 1); source set 2 uses vision messages."""
     return {
         "VISO_TYPE": 1,
-        "VISO_POS_M_NSE": sigma_m,
+        "VISO_POS_M_NSE": 0.5,
         "VISO_DELAY_MS": delay_ms,
         **_sources(1, position=3, velocity=3, climb=3),
         **_sources(2, position=6, velocity=6, climb=0),
@@ -62,16 +62,15 @@ def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[
     }
 
 
-def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
+def vision_only_parameters() -> dict[str, float]:
     """ArduPilot parameters of a vehicle without a GNSS receiver that navigates on vision. The EKF
-    has no position until an origin is sent. sigma_m: noise of the positions, 1 sigma; delay_ms:
-    their age.
+    has no position until an origin is sent.
     """
     return {
         "GPS1_TYPE": 0,
         "VISO_TYPE": 1,
-        "VISO_POS_M_NSE": sigma_m,
-        "VISO_DELAY_MS": delay_ms,
+        "VISO_POS_M_NSE": 0.5,
+        "VISO_DELAY_MS": 100.0,
         **_sources(1, position=6, velocity=0, climb=0),
     }
 
@@ -91,11 +90,11 @@ def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
     }
 
 
-def gps_input_only_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
+def gps_input_only_parameters() -> dict[str, float]:
     """Parameters of a vehicle whose only receiver is GPS_INPUT (gps_id 0), without velocity."""
     return {
         "GPS1_TYPE": 14,
-        "GPS1_DELAY_MS": delay_ms,
+        "GPS1_DELAY_MS": 100.0,
         **_sources(1, position=3, velocity=0, climb=0),
     }
 

@@ -13,7 +13,6 @@ from companion.geometry import (
     GimbalFrame,
     Mount,
     camera_attitude,
-    ned_from_world,
     world_from_camera,
 )
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
@@ -77,13 +76,13 @@ def test_agrees_with_the_pose_files_angles() -> None:
 
 def test_ned_at_a_far_point_is_turned_by_the_earths_curvature() -> None:
     frame = LocalFrame(Geodetic(47.0, 8.0, 400.0))
-    np.testing.assert_allclose(ned_from_world(frame, frame.origin), NED_FROM_ENU, atol=1e-12)
+    np.testing.assert_allclose(frame.ned_from_enu(frame.origin), NED_FROM_ENU, atol=1e-12)
     north = frame.position([0.0, 10_000.0, 0.0])
-    down = ned_from_world(frame, north)[2]  # in the map's axes
+    down = frame.ned_from_enu(north)[2]  # in the map's axes
     # Down at a point further north leans back to the south, by 10 km over the meridian's radius.
     assert down[1] == pytest.approx(-10_000 / 6_370_000, rel=0.01)
     assert down[2] == pytest.approx(-1, abs=1e-5)
-    R = ned_from_world(frame, frame.position([20_000.0, 0.0, 0.0]))
+    R = frame.ned_from_enu(frame.position([20_000.0, 0.0, 0.0]))
     tilt = math.degrees(math.acos((np.trace(R @ NED_FROM_ENU.T) - 1) / 2))
     assert 0.2 < tilt < 0.4  # 20 km east: 0.18° of tilt and 0.2° of convergence
 

@@ -18,7 +18,7 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LookAt
-from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.clock import SteadyUtc
@@ -92,7 +92,7 @@ class Flight:
             config,
             GEOID,
             SteadyUtc(1_790_000_000 * SECOND, self.now_ns),
-            VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), True),
+            VehicleTracker(BridgeConfig(camera=CameraConfig(mount="fixed"))),
             self.now_ns,
             lambda: HealthLevel.OK,
             self.alerts.append,
@@ -270,7 +270,7 @@ def exchanging(
 ) -> tuple[OriginExchange, Any, list[Alert]]:
     """An exchange of the EKF's origin with a vehicle that is not armed, its link and its alerts."""
     told: list[Alert] = []
-    tracker = VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), True)
+    tracker = VehicleTracker(BridgeConfig(camera=CameraConfig(mount="fixed")))
     config, notifier = BridgeConfig(origin=configured), StatusNotifier(told.append)
     exchange = OriginExchange(config, tracker, Commander(191), notifier, Counter())
     return exchange, SimulatedLink(system_id=1), told

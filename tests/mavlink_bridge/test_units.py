@@ -17,7 +17,7 @@ from mavlink_bridge.camera.messages import (
     video_stream_information,
 )
 from mavlink_bridge.camera.targets import adsb_vehicle, tracking_geo_status
-from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig
+from mavlink_bridge.config import BridgeConfig, CameraConfig, InjectionConfig, OriginConfig
 from mavlink_bridge.injection.encode import (
     EncodedEstimate,
     global_position_sensor,
@@ -145,7 +145,7 @@ def test_the_origin_is_set_and_read_in_the_units_of_the_definition() -> None:
 
 def read(name: str, values: dict[str, float], **others: Any) -> VehicleTracker:
     """A tracker that took in one message, its fields given in degrees, metres, m/s."""
-    tracker = VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), False)
+    tracker = VehicleTracker(BridgeConfig())
     for message, time_ns in sent(name, values, **others):
         tracker.handle(message, time_ns)
     return tracker

@@ -14,6 +14,7 @@ from localizer.synth.config import SURVEY, VisitLook
 from localizer.types import Image
 
 CAR_LENGTH_M, CAR_WIDTH_M, CAR_HEIGHT_M = 4.5, 1.84, 1.5
+_PERSON_M = 1.75
 _PX_PER_M = 16
 _SIDE_ROW_M = 2.0  # texture rows: top view first, then the side view from here
 
@@ -129,7 +130,7 @@ def car_mesh(colour: tuple[int, int, int] | None = None, seed: int = 0) -> TileM
     return _tile_mesh(car_shape(), car_image(chosen, seed))
 
 
-def person_mesh(clothes: tuple[int, int, int] = (70, 84, 120), height_m: float = 1.75) -> TileMesh:
+def person_mesh(clothes: tuple[int, int, int]) -> TileMesh:
     """A standing person: a faceted body of legs, torso and head, origin between the feet."""
     sides = 6
     #        z as a share of height, half depth, half width, colour row
@@ -140,13 +141,13 @@ def person_mesh(clothes: tuple[int, int, int] = (70, 84, 120), height_m: float =
     positions, uvs, faces = [], [], []
     for z, depth, width, row in rings:
         for angle in turn:
-            positions.append((depth * np.cos(angle), width * np.sin(angle), z * height_m))
+            positions.append((depth * np.cos(angle), width * np.sin(angle), z * _PERSON_M))
             uvs.append((0.1 + 0.8 * (0.5 + 0.5 * np.cos(angle)), row))
     for ring in range(len(rings) - 1):
         for k in range(sides):
             a, b = ring * sides + k, ring * sides + (k + 1) % sides
             faces += [(a, b, b + sides), (a, b + sides, a + sides)]
-    positions.append((0.0, 0.0, height_m))
+    positions.append((0.0, 0.0, _PERSON_M))
     uvs.append((0.5, 0.97))
     last = (len(rings) - 1) * sides
     faces += [(last + k, last + (k + 1) % sides, len(positions) - 1) for k in range(sides)]

@@ -61,14 +61,15 @@ class Flight:
     def report_alert(self, alert: Alert) -> None:
         self.said.append(alert)
 
-    def fly(self, judge: MapOffsetEstimator, seconds: float) -> None:
+    def fly(self, judge: MapOffsetEstimator, seconds: float, *, applies: bool = True) -> None:
         seen = PoseEstimate.__new__(PoseEstimate)
         object.__setattr__(seen, "state", TrackingState.TRACKING)
         for k in range(self._now, self._now + round(seconds * HZ)):
             place = np.array(self.true(k)) + self.shift + self._rng.normal(0, 0.1, 2)
             fix = VisionFix(k * SECOND // HZ, *offset(*HOME, *place), 550.0)
             self._clock_ns = fix.time_ns + LATENCY_NS
-            self.fixes.append(judge.check(seen, fix))
+            self.fixes.append(judge.corrected(fix) if applies else fix)
+            judge.add_fix(seen, fix)
         self._now += round(seconds * HZ)
 
     def error(self, k: int) -> float:
@@ -85,7 +86,7 @@ def judge(flight: Flight, policy: Policy = "tell") -> MapOffsetEstimator:
 def test_a_shifted_map_is_told_once_and_changes_nothing() -> None:
     flight = Flight((0.1, 3.4))
     shift = judge(flight)
-    flight.fly(shift, 240)
+    flight.fly(shift, 240, applies=False)
     assert len(flight.said) == 1
     assert flight.said[0].values[0] == pytest.approx(3.4, abs=0.5)
     assert flight.said[0].values[1:] == ("east", "")

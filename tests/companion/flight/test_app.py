@@ -19,9 +19,9 @@ import pytest
 from companion.config import parse_config
 from companion.errors import ConfigError, ReportError, StreamOpenError
 from companion.flight.app import Companion
+from companion.flight.channels import Feed
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Component
-from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 import yaml
 
+from companion.calibration_watch.map_offset import MapOffsetEstimator
 from companion.config import load_config, parse_config
 from companion.conversions import CameraExtrinsics
-from companion.flight.channels import Channel
+from companion.flight.channels import Channel, Feed
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly, Component
-from companion.flight.feed import Feed
 from companion.flight.injection import FixInjection
 from companion.inertial import InertialTrack
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
@@ -154,6 +154,25 @@ def test_the_guardian_is_made_of_a_deployment_in_a_folder_whose_name_is_no_utf8(
     with ExitStack() as up:
         assembly.make(up)
         assert assembly.get(IntegrityMonitor) is not None
+
+
+@pytest.mark.parametrize("policy", ["tell", "apply"])
+def test_fixes_are_corrected_by_the_maps_offset_only_where_that_is_wanted(policy):
+    checks: list[Any] = []
+    observers: list[Any] = []
+    fixes = SimpleNamespace(add_check=checks.append, add_observer=observers.append)
+    config = _config(connection="tcp:127.0.0.1:5763", injection={"map_shift": policy})
+    parts: list[Component[Any]] = [
+        Component("bridge", Bridge, partial(_given, object())),
+        Component("injection", FixInjection, partial(_given, fixes)),
+        *(part for part in COMPONENTS if part.kind is MapOffsetEstimator),
+    ]
+    assembly = Assembly(config, parts)
+    with ExitStack() as up:
+        assembly.make(up)
+    shift = assembly[MapOffsetEstimator]
+    assert checks == ([shift.corrected] if policy == "apply" else [])
+    assert len(observers) == 1
 
 
 # --- The feed hands frames on, whatever becomes of them -----------------------------------------

@@ -91,7 +91,7 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
     bridge, seen, verdicts = FakeBridge(), [], iter([None, "wider", "as it is"])
     injection = FixInjection(bridge, EXTRINSICS)
 
-    def judge(estimate, fix):
+    def judge(fix):
         verdict = next(verdicts)
         if verdict == "wider":
             return replace(fix, position_covariance_ned=4.0 * fix.position_covariance_ned)
@@ -109,7 +109,7 @@ def test_a_judge_withholds_or_widens_and_observers_see_each_fix_as_it_was_made()
 def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
     bridge, broken = FakeBridge(), [False]
 
-    def judge(_, fix):
+    def judge(fix):
         if broken[0]:
             raise ZeroDivisionError
         return fix

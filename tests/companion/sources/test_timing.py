@@ -8,7 +8,6 @@ import pytest
 from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
 from companion.sources.timing import (
     ExposureClock,
-    FrameTimestamps,
     MinimumLag,
     Timing,
     system_minus_monotonic,
@@ -112,7 +111,7 @@ def _locked_misp(clocks: Clocks) -> MispTime:
 )
 def test_the_best_stamp_gives_the_exposure(clocks, pts, misp, device, age_ms):
     now, clock = clocks.now_ns, ExposureClock(latency_ns=30 * MS, device=device)
-    exposed = clock.exposure_time(FrameTimestamps(pts(clocks), misp(clocks)), now)
+    exposed = clock.exposure_time(pts(clocks), misp(clocks), now)
     assert now - exposed == pytest.approx(age_ms * MS, abs=0.1 * MS)
 
 
@@ -125,8 +124,7 @@ def test_a_misp_clock_that_is_not_ours_gives_differences_only(clocks, offset_ns,
     for i, lag in enumerate([30, 55, 48]):
         true = now + i * 100 * MS
         misp = MispTime((true + offset_ns + clocks.offset_ns) // 1000, locked)
-        stamps = FrameTimestamps(None, misp)
-        result = clock.exposure_time(stamps, true + lag * MS)
+        result = clock.exposure_time(None, misp, true + lag * MS)
         assert result == pytest.approx(true, abs=0.2 * MS)
     assert caplog.text.count("MISP clock") == 1
 
@@ -140,7 +138,7 @@ def test_a_step_of_the_wall_clock_is_told_and_enters_no_exposure_time(clocks, ca
         clocks.now_ns += 100 * MS
         now = clocks.now_ns
         stamp = MispTime((now - 120 * MS + camera_offset_ns) // 1000, locked=True)
-        return now - clock.exposure_time(FrameTimestamps(None, stamp), now)
+        return now - clock.exposure_time(None, stamp, now)
 
     assert seen() == pytest.approx(120e6, abs=0.1e6)
     clocks.offset_ns += round(step_s * 1e9)
@@ -164,7 +162,7 @@ def test_a_camera_that_loses_its_reference_keeps_its_times(clocks: Clocks) -> No
         now = clocks.now_ns
         lag = (120 + 7 * (k % 3)) * MS
         misp = MispTime((now - lag + clocks.offset_ns) // 1000, locked=k < 20)
-        exposed = clock.exposure_time(FrameTimestamps(None, misp), now)
+        exposed = clock.exposure_time(None, misp, now)
         if k > 5:
             assert exposed == pytest.approx(now - lag, abs=0.2 * MS)
 
@@ -198,12 +196,12 @@ def test_no_stamp_whatever_it_says_makes_a_frame_of_the_future_or_of_long_ago(
             misp += int(rng.choice(leaps))
             wall_ns[0] += int(rng.choice(leaps)) if rng.random() < 0.05 else 0
         stamp = MispTime(max(misp + 10**18, 0) // 1000, locked=bool(rng.random() < 0.8))
-        stamps = FrameTimestamps(
+        stamps = (
             None if restless and rng.random() < 0.1 else pts,
             None if restless and rng.random() < 0.2 else stamp,
         )
         late = int(rng.exponential(10 * MS))
-        exposed = clock.exposure_time(stamps, arrival + late)
+        exposed = clock.exposure_time(*stamps, arrival + late)
         assert -4 * 10**9 <= exposed - (arrival + late) <= 5 * MS
         good.append(exposed - arrival)
     assert np.ptp(good[2500:]) < 5 * MS  # steady again within half a minute

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from companion.config import CompanionConfig, parse_config
-from companion.flight.feed import Feed
+from companion.flight.channels import Feed
 from companion.supervision.processes import ENDING, Beat, FlightProcess
 from companion.supervision.pulse import Pulse, line
 from companion.supervision.restart import without_lost_disks, write_problem

@@ -22,10 +22,9 @@ from localizer.geometry.pose import Pose
 from localizer.registration.config import JNGOConfig
 from localizer.render import select
 from localizer.tracking.engine_health import HealthCounters
-from localizer.tracking.mailbox import Mailbox
+from localizer.tracking.mailbox import FeaturePrefetcher, Mailbox, ProcessingTimes
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
-from localizer.tracking.prefetch import FeaturePrefetcher, ProcessingTimes
 from localizer.types import FeaturePyramid, Frame, PosePrior
 
 CAMERA = Camera.from_fov(64, 48, 60.0)

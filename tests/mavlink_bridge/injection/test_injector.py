@@ -91,7 +91,7 @@ def fly(
 def test_fix_is_sent_at_the_configured_delay_with_its_exposure_time() -> None:
     it = injector(rate_hz=10, delay_ms=100)
     assert (
-        it.latency.median_ms is it.yaw_difference_rad is it.refused_yaw_rad is None
+        it.latency.median_ms is it.guard.difference_rad is it.guard.refused_rad is None
     )  # not yet known
     sent = fly(it, seconds=3, fix_hz=10, latency_ms=40)
     assert it.latency.median_ms == pytest.approx(40.0)
@@ -272,7 +272,7 @@ def test_autopilots_own_yaw_error_does_not_withhold_vision(error: Any) -> None:
     sent = fly(it, seconds=12, fix_hz=10, latency_ms=0, where=context(yaw_error_deg=error))
     assert len(sent) >= 118
     assert it.counters["fixes_yaw_refused"] == 0
-    assert math.degrees(it.yaw_difference_rad) == pytest.approx(8.0)
+    assert math.degrees(it.guard.difference_rad) == pytest.approx(8.0)
 
 
 def test_gross_difference_is_refused_however_slowly_it_came() -> None:

@@ -17,7 +17,7 @@ from mavlink_bridge import quaternion as quat
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.config import BridgeConfig, OriginConfig
+from mavlink_bridge.config import BridgeConfig, CameraConfig, OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.status_notifier import StatusNotifier
 from mavlink_bridge.vehicle.origin import north_east
@@ -33,11 +33,8 @@ def sent(message: Any, system: int = 1, component: int = 1) -> Any:
     return codec.decode(bytearray(message.pack(codec)))
 
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-
-
-def tracker(mount: quat.Quaternion = LEVEL, *, fixed: bool = False) -> VehicleTracker:
-    it = VehicleTracker(None, mount, fixed)
+def tracker(**camera: Any) -> VehicleTracker:
+    it = VehicleTracker(BridgeConfig(camera=CameraConfig(**camera)))
     heartbeat = sent(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3))
     assert it.accepts(heartbeat)
     it.handle(heartbeat, SECOND)
@@ -143,7 +140,7 @@ def test_old_mount_messages_are_used_only_without_the_new_one() -> None:
 
 
 def test_fixed_camera_follows_the_body_and_its_mounting() -> None:
-    it = tracker(quat.from_euler(0.0, math.radians(-60.0), 0.0), fixed=True)
+    it = tracker(mount="fixed", mount_pitch_deg=-60.0)
     m = mavlink.MAVLink_attitude_message(0, 0.0, math.radians(10.0), 1.0, 0.0, 0.0, 0.0)
     it.handle(sent(m), 10 * SECOND)
     at = it.gimbal_at(10 * SECOND)
@@ -153,7 +150,7 @@ def test_fixed_camera_follows_the_body_and_its_mounting() -> None:
 
 
 def test_other_systems_ground_stations_and_companions_are_not_the_vehicle() -> None:
-    it = VehicleTracker(None, LEVEL, False)
+    it = VehicleTracker(BridgeConfig())
     assert not it.accepts(sent(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255, 190))
     assert not it.accepts(sent(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 7, 191))
     assert it.snapshot(SECOND).system_id is None
@@ -349,7 +346,7 @@ def test_foreign_senders_in_turn_do_not_flood_the_ground_station() -> None:
 
 
 def test_the_configured_gimbal_counts_whoever_spoke_first() -> None:
-    it = VehicleTracker(None, LEVEL, False, (0, 2))
+    it = VehicleTracker(BridgeConfig(camera=CameraConfig(gimbal_device=2)))
     it.handle(sent(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)), SECOND)
     fly_level(it, 2.0, lambda _: {CAMERA_GIMBAL: 10.0, OTHER_GIMBAL: 100.0})
     assert looks(it, 1025) == pytest.approx(100.0, abs=0.01)
