@@ -55,7 +55,7 @@ def _gaussian(sigma: float) -> Float32:
     radius = (round(8 * sigma + 1) | 1) // 2
     x = np.arange(-radius, radius + 1)
     kernel = np.exp(-(x**2) / (2 * sigma**2))
-    return (kernel / kernel.sum()).astype(np.float32)
+    return np.asarray(kernel / kernel.sum(), np.float32)
 
 
 def _even(taps: Float32) -> Float32:

@@ -169,7 +169,8 @@ def _patch_grid(problem: LevelProblem, rotation: Array, translation: Array) -> _
     # The window of every anchor lies in the image, or the image's edge would vote.
     seen = seen_anchors(problem, rotation, translation, border=_REACH)
     shown = seen.confidence > 0.0  # a picture there
-    anchor, x, u, v, confidence = (values[shown] for values in seen)
+    anchor = seen.anchor[shown]
+    x, u, v, confidence = (values[shown] for values in seen[1:])
     part_px = max(_PART_PX, (h * w * _ANCHORS_A_PART / problem.points.shape[1]) ** 0.5)
     across = int(w // part_px) + 1
     key = (v // part_px).astype(np.int64) * across + (u // part_px).astype(np.int64)
