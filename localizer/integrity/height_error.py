@@ -84,14 +84,21 @@ def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array)
     return np.where(sign > 0, likelihood, -np.inf)
 
 
+def _mean_square(log_posterior: Array) -> float:
+    weight = np.exp(log_posterior - log_posterior.max())
+    return float((weight * CANDIDATES_M**2).sum() / weight.sum())
+
+
 @dataclass(frozen=True)
 class MapHeightError:
     """Posterior of the RMS height that the map lacks. log_prior: (K,) by the map's kind; evidence:
-    (K,) log likelihood of the images so far, with less weight for older ground.
+    (K,) log likelihood of the images so far, with less weight for older ground; calibrated_m2: mean
+    square that `CalibrationSigmas.map_m` contains.
     """
 
     log_prior: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
     evidence: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
+    calibrated_m2: float = 0.0
 
     @classmethod
     def prior(cls, expected_m: float | None) -> MapHeightError:
@@ -99,7 +106,8 @@ class MapHeightError:
         if expected_m is None:
             return cls()
         if expected_m <= _SURE_M:
-            return cls(-CANDIDATES_M / _SURE_M)
+            log_prior = -CANDIDATES_M / _SURE_M
+            return cls(log_prior, calibrated_m2=_mean_square(log_prior))
         off = np.log2(np.maximum(CANDIDATES_M, 0.15) / expected_m)
         return cls(-0.5 * off**2)
 
@@ -114,10 +122,9 @@ class MapHeightError:
 
     @property
     def sigma_m(self) -> float:
-        """RMS missing height over the posterior, m."""
-        total = self.log_prior + self.evidence
-        weight = np.exp(total - total.max())
-        return float(np.sqrt((weight * CANDIDATES_M**2).sum() / weight.sum()))
+        """RMS missing height over the posterior, m; of a surface model what exceeds its prior."""
+        missing_m2 = _mean_square(self.log_prior + self.evidence) - self.calibrated_m2
+        return float(np.sqrt(max(missing_m2, 0.0)))
 
     def updated(self, likelihood: Array) -> MapHeightError:
         """The posterior after another image of new ground, by its `height_likelihood` (K,)."""

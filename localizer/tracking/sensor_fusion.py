@@ -55,7 +55,8 @@ def with_map_error(result: Registration, height_sigma_m: float) -> Registration:
         return result
     if votes.displacements is None:
         return result
-    covariance = patch_covariance(votes.displacements, height_sigma_m)
+    by_residuals = result.covariance - result.mode_covariance
+    covariance = patch_covariance(votes.displacements, height_sigma_m, by_residuals)
     if covariance is None:
         return replace(result, status=RegistrationStatus.NO_TEXTURE)
     # The patches' displacements are the map's, alike from frame to frame. A motion filter that

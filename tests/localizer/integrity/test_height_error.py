@@ -16,6 +16,7 @@ from localizer.registration.priors import attitude_constraint, combine, fuse, he
 HEIGHT_M, FOCAL_PX = 120.0, 110.0
 DOWN = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, HEIGHT_M]))
 BLOCKS_M = 25.0
+NOTHING = np.zeros((6, 6))  # of the residuals
 
 
 def patches() -> tuple[Array, Array]:
@@ -83,7 +84,7 @@ def test_errors_over_a_town_are_within_what_is_claimed():
     for seed in range(40):
         seen, off = town(5.0, seed)
         for values, sigma_m in ((honest, 5.0), (naive, 0.0)):
-            covariance = patch_covariance(seen, sigma_m)
+            covariance = patch_covariance(seen, sigma_m, NOTHING)
             assert covariance is not None
             values.append(off[:3] @ np.linalg.solve(covariance[:3, :3], off[:3]) / 3)
     assert np.mean(np.array(honest) < 2.6) > 0.9
@@ -94,7 +95,7 @@ def test_gravity_and_height_undo_what_the_roofs_pulled():
     before, after, ratio = [], [], []
     for seed in range(40):
         seen, off = town(5.0, seed)
-        found = fuse(registered(off), patch_covariance(seen, 5.0), gravity(seed))
+        found = fuse(registered(off), patch_covariance(seen, 5.0, NOTHING), gravity(seed))
         left = found.world_from_camera.translation - DOWN.translation
         before.append(np.linalg.norm(off[:3]))
         after.append(np.linalg.norm(left))
@@ -105,7 +106,7 @@ def test_gravity_and_height_undo_what_the_roofs_pulled():
 
 def test_a_surface_model_is_taken_at_its_word_until_images_contradict():
     surface = MapHeightError.prior(0.0)
-    assert surface.sigma_m < 0.2
+    assert surface.sigma_m == 0.0
     for seed in range(6):
         seen, off = town(5.0, seed)
         surface = surface.updated(height_likelihood(seen, registered(off), gravity(seed)))
@@ -133,13 +134,31 @@ def test_too_few_patches_say_nothing():
     seen, off = town(5.0, 0)
     few = PatchDisplacements(seen.shift[:5], seen.motion[:5], seen.rise[:5], seen.ground[:5])
     assert height_likelihood(few, registered(off), None) is None
-    assert patch_covariance(few, 5.0) is None
+    assert patch_covariance(few, 5.0, NOTHING) is None
 
 
 def test_a_pose_that_half_the_patches_hold_is_twice_as_uncertain():
     seen, _ = town(0.0, 0)
-    whole, half = (patch_covariance(replace(seen, matched=f), 0.0) for f in (1.0, 0.5))
+    whole, half = (patch_covariance(replace(seen, matched=f), 0.0, NOTHING) for f in (1.0, 0.5))
     assert whole is not None
     assert half == pytest.approx(4.0 * whole)
-    assert patch_covariance(replace(seen, matched=0.0), 0.0) is None
+    assert patch_covariance(replace(seen, matched=0.0), 0.0, NOTHING) is None
     assert CANDIDATES_M[0] == 0.0
+
+
+def test_patches_that_scatter_less_than_the_residuals_explain_add_nothing():
+    seen, _ = town(0.0, 0)
+    by_residuals = np.diag([4.0, 9.0, 1.0, 1e-3, 2e-3, 1e-3])
+    found = patch_covariance(seen, 0.0, by_residuals)
+    assert found == pytest.approx(0.5 * by_residuals)
+
+
+def test_patches_that_scatter_more_than_the_residuals_explain_add_the_difference():
+    """Over all axes together the pose is as uncertain as by the patches alone."""
+    seen, _ = town(0.0, 0)
+    rows = seen.motion.reshape(-1, 6)
+    alone = patch_covariance(seen, 0.0, NOTHING)
+    by_residuals = np.diag([4.0, 9.0, 1.0, 1e-3, 2e-3, 1e-3]) * 1e-4
+    found = patch_covariance(seen, 0.0, by_residuals)
+    assert np.trace(rows.T @ rows @ found) == pytest.approx(np.trace(rows.T @ rows @ alone))
+    assert (found - 0.5 * by_residuals)[0, 0] < alone[0, 0]
