@@ -18,7 +18,7 @@ from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.ground import TerrainModel
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
-from localizer.odometry.usability import examine
+from localizer.odometry.usability import find_fault
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
@@ -142,8 +142,8 @@ class Flyer:
         for time_s, pose in zip(stretch.times_s, stretch.poses, strict=True):
             image = self._picture(pose, look, rng)
             time_ns = _STARTED_NS + round(time_s * 1e9)
-            verdict = examine(image, previous)
-            yield OdometryFrame(self._extractor.extract(image), time_ns, verdict)
+            fault = find_fault(image, previous)
+            yield OdometryFrame(self._extractor.extract(image), time_ns, fault)
             previous = image
 
     def _picture(self, pose: Pose, look: Appearance, rng: np.random.Generator) -> Image:

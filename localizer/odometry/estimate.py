@@ -9,7 +9,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry.keyframe import DepthSource
-from localizer.odometry.usability import Usability
+from localizer.odometry.usability import ImageFault
 from localizer.types import FeaturePyramid
 
 
@@ -27,14 +27,14 @@ class OdometryFrame:
     """Data of one frame for the odometry.
 
     features: of the undistorted image, in host memory, as for the map registration. time_ns: the
-    exposure's. usability: result of `usability.examine`, None if the frame was not examined. sweep:
+    exposure's. fault: as by `usability.find_fault`, None also if the frame was not examined. sweep:
     the camera's motion during the readout; None for a global shutter. camera: the pinhole of the
     features; None: the odometry's, for a lens that does not zoom.
     """
 
     features: FeaturePyramid
     time_ns: int
-    usability: Usability | None = None
+    fault: ImageFault | None = None
     sweep: Sweep | None = None
     camera: Camera | None = None
 

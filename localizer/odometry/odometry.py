@@ -154,9 +154,9 @@ class VisualOdometry:
             return self._failed(
                 OdometryStatus.LOST, f"nothing usable for {gap:.1f} s", frame, prior, keyframe
             )
-        if frame.usability is not None and frame.usability.fault is not None:
+        if frame.fault is not None:
             return self._failed(
-                OdometryStatus.UNUSABLE_IMAGE, frame.usability.fault.value, frame, prior, keyframe
+                OdometryStatus.UNUSABLE_IMAGE, frame.fault.value, frame, prior, keyframe
             )
         camera = frame.camera or self._camera
         result = self._optimizer.register(

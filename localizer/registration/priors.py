@@ -77,14 +77,12 @@ def combine(*constraints: PoseConstraint) -> PoseConstraint:
 @dataclass(frozen=True)
 class FusedPose:
     """A pose after a constraint was fused. covariance: (6, 6) as `PosePrior`'s; innovation_squared:
-    squared Mahalanobis distance of the constraint from the pose before, with `dof` degrees of
-    freedom.
+    squared Mahalanobis distance of the constraint from the pose before.
     """
 
     world_from_camera: Pose
     covariance: Array
     innovation_squared: float
-    dof: int
 
 
 def constraint_rows(constraint: PoseConstraint, pose: Pose) -> tuple[Array, Array]:
@@ -117,7 +115,7 @@ def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose
     variance, axes = np.linalg.eigh(known)  # in units of the sensor's own
     heard = variance > 1.0
     if not heard.any():
-        return FusedPose(pose, covariance, squared, len(values))
+        return FusedPose(pose, covariance, squared)
     rows, values, variance = (axes.T @ rows)[heard], (axes.T @ values)[heard], variance[heard]
     # The directions are uncorrelated, so P + R P / (P - R) = P² / (P - R) is the spread of each.
     gain = (rows @ covariance).T * ((variance - 1.0) / variance**2)
@@ -127,5 +125,4 @@ def fuse(pose: Pose, covariance: Array, constraint: PoseConstraint) -> FusedPose
         Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]),
         0.5 * (after + after.T),
         squared,
-        len(values),
     )

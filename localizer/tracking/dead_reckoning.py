@@ -21,7 +21,7 @@ from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryFrame, OdometryStatus
 from localizer.odometry.ground import TerrainModel
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
-from localizer.odometry.usability import examine
+from localizer.odometry.usability import find_fault
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
     PoseConstraint,
@@ -137,7 +137,7 @@ class DeadReckoning:
         if not self._odometry.ready:
             return _NOTHING
         camera = with_field_of_view(self._pinhole, frame.camera)
-        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep, camera)
+        seen = OdometryFrame(query, frame.exposure_time_ns, find_fault(frame.image), sweep, camera)
         surface = anchors.points_world if anchors is not None else None
         constraint = self._constraint(frame.exposure_time_ns, prediction.world_from_camera)
         try:

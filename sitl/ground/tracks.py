@@ -86,14 +86,12 @@ class GimbalState:
 
 @dataclass(frozen=True)
 class EkfSample:
-    """LOCAL_POSITION_NED with EKF origin (None: not set) and flags; times as in `Truth`."""
+    """LOCAL_POSITION_NED with EKF origin (None: not set); times as in `Truth`."""
 
     time_ns: int
     boot_s: float
     position_ned: tuple[float, float, float]
-    velocity_ned: tuple[float, float, float]
     origin: Location | None
-    flags: int
 
     @property
     def location(self) -> Location | None:

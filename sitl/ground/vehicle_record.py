@@ -192,9 +192,7 @@ class VehicleRecord:
                 self._clock.monotonic_ns(message.time_boot_ms),
                 message.time_boot_ms / 1000.0,
                 (message.x, message.y, message.z),
-                (message.vx, message.vy, message.vz),
                 self.origin,
-                self.ekf_flags,
             )
         )
 

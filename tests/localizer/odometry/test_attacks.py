@@ -15,7 +15,7 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.ground import FlatGround
 from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
-from localizer.odometry.usability import examine
+from localizer.odometry.usability import find_fault
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import attitude_constraint, combine, height_constraint
 from localizer.tracking import motion
@@ -120,9 +120,9 @@ def flown(
     for k in range(FRAMES):
         true = pose(0 if hovers else k)
         image = spoil(view(ground, 0 if hovers else k), k, rng)
-        usability = examine(image, previous)
+        fault = find_fault(image, previous)
         working = cv2.resize(image, (WORKING.width, WORKING.height), interpolation=cv2.INTER_AREA)
-        frame = OdometryFrame(extractor.extract(working), k * STEP_NS, usability)
+        frame = OdometryFrame(extractor.extract(working), k * STEP_NS, fault)
         tilt = so3_exp(np.radians([*rng.normal(0.0, tilt_sigma_deg, 2), 0.0]))
         attitude = attitude_constraint(tilt @ true.rotation, np.radians(0.4), np.radians(3.0))
         sensed = combine(attitude, height_constraint(HEIGHT_M, 0.5))
