@@ -24,7 +24,6 @@ _ACCELERATION = (0.45, 0.45, 0.02)
 _SPEED_SIGMA = (10.0, 10.0, 2.0)  # m/s, before anything is known
 _GATE = 25.0  # squared Mahalanobis distance, 3 dimensions
 _OUTLIERS = 3  # sightings in a row that no track explains: the target is elsewhere
-_LONELY = 0.01  # factor for a track whose surface is not in the sighting, while another's is
 _NEGLIGIBLE = 1e-3
 _MOST_TRACKS = 6
 _SAME = 1.0  # squared Mahalanobis distance below which two tracks are one
@@ -142,7 +141,7 @@ def _met(
     count only between surfaces that a track cannot separate. If they counted in every frame, a
     constant error of the map's edge or of the aim would be taken for evidence.
     """
-    met, lonely = [], []
+    met = []
     for track in tracks:
         pairs = [(s, _likelihood(track, s)) for s in surfaces]
         pairs = [(s, likelihood) for s, likelihood in pairs if likelihood > 0.0]
@@ -155,11 +154,7 @@ def _met(
             met.append(
                 _TrackHypothesis(weight, np.asarray(mean), np.asarray(P), track.sightings + 1)
             )
-        if not pairs:
-            lonely.append(track)
-    heaviest = max((t.weight for t in met), default=0.0)
-    factor = _LONELY * heaviest / max((t.weight for t in tracks), default=1.0)
-    return met + [replace(t, weight=t.weight * factor) for t in lonely] if met else []
+    return met
 
 
 def _likelihood(track: _TrackHypothesis, surface: TargetSurface) -> float:
@@ -182,18 +177,9 @@ def _reduced(tracks: list[_TrackHypothesis]) -> list[_TrackHypothesis]:
         head = waiting[0]
         offsets = [t.mean - head.mean for t in waiting]
         same = [o @ np.linalg.solve(head.covariance, o) < _SAME for o in offsets]
-        kept.append(_merged([t for t, s in zip(waiting, same, strict=True) if s]))
+        weight = sum(t.weight for t, s in zip(waiting, same, strict=True) if s)
+        kept.append(replace(head, weight=weight))
         waiting = [t for t, s in zip(waiting, same, strict=True) if not s]
     kept = [t for t in kept if t.weight >= _NEGLIGIBLE * total]
     total = sum(t.weight for t in kept)
     return sorted((replace(t, weight=t.weight / total) for t in kept), key=lambda t: -t.weight)
-
-
-def _merged(tracks: list[_TrackHypothesis]) -> _TrackHypothesis:
-    """One Gaussian with the tracks' common mean and covariance."""
-    weight = sum(t.weight for t in tracks)
-    mean = np.sum([t.weight * t.mean for t in tracks], axis=0) / weight
-    covariance = np.zeros((6, 6))
-    for t in tracks:
-        covariance += t.weight / weight * (t.covariance + np.outer(t.mean - mean, t.mean - mean))
-    return _TrackHypothesis(weight, mean, covariance, max(t.sightings for t in tracks))
