@@ -160,5 +160,7 @@ def test_patches_that_scatter_more_than_the_residuals_explain_add_the_difference
     alone = patch_covariance(seen, 0.0, NOTHING)
     by_residuals = np.diag([4.0, 9.0, 1.0, 1e-3, 2e-3, 1e-3]) * 1e-4
     found = patch_covariance(seen, 0.0, by_residuals)
+    assert alone is not None
+    assert found is not None
     assert np.trace(rows.T @ rows @ found) == pytest.approx(np.trace(rows.T @ rows @ alone))
     assert (found - 0.5 * by_residuals)[0, 0] < alone[0, 0]
