@@ -404,7 +404,7 @@ class _MapSearch:
         mine: dict[float, list[Trial]] = {}
         for trial in trials:
             mine.setdefault(trial.of.heading_rad, []).append(trial)
-        noise = np.ones(len(trials))
+        noise = np.full(len(trials), theirs.mean())
         for other in (trial for look in looks for trial in look.trials):
             for trial in mine.get(other.of.heading_rad, ()):
                 if trial.of.height_m == other.of.height_m:
@@ -425,8 +425,8 @@ class _MapSearch:
                     near = np.outer(abs(middles - row) <= reach, abs(middles - column) <= reach)
                     near &= suited.mask
                     if near.any():
-                        before = found.get(block, suited).mask if block in found else near
-                        found[block] = replace(suited, mask=near | before)
+                        mask = near | found[block].mask if block in found else near
+                        found[block] = replace(suited, mask=mask)
         return noise, wanted
 
     def jobs(self) -> list[tuple[Rectification, tuple[Trial, ...]]]:
