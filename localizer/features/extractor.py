@@ -3,7 +3,9 @@
 A model is two files: ``NAME.onnx`` and ``NAME.json``. The graph takes ``image`` (1, H, W, 3) uint8
 RGB with H and W divisible by the description's `multiple`. For each level, coarse to fine, it gives
 ``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w) float32
-in (0, 1). The JSON file names the levels and has the SHA-256 of the graph.
+in (0, 1). The JSON file names the levels and has the SHA-256 of the graph. If `orientation` is true
+there, the graph gives ``learned_K`` (1, h, w, C - 7) float32 instead, from which
+`orientation_level` makes both.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from localizer.errors import ModelError
 from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
 from localizer.features.openvino_session import PROVIDER as OPENVINO
+from localizer.features.orientation import gray_of, orientation_level
 from localizer.features.providers import Expected, Session, provider_of, start_session
 from localizer.features.subgraph import cut_to_outputs
 from localizer.plain_files import plain_bytes, plain_text
@@ -54,7 +57,9 @@ class LevelInfo(BaseModel):
 
 
 class ModelInfo(BaseModel):
-    """Content of the JSON file beside a model. multiple: what image sides must be divisible by."""
+    """Content of the JSON file beside a model. multiple: what image sides must be divisible by;
+    orientation: whether the graph lacks the channels that nobody learned.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     name: str
@@ -62,6 +67,7 @@ class ModelInfo(BaseModel):
     levels: tuple[LevelInfo, ...] = Field(min_length=1)
     parameters: int = Field(gt=0)
     multiple: int = Field(default=8, gt=0, le=64)
+    orientation: bool = False
     training: dict[str, object] = {}
 
     @model_validator(mode="after")
@@ -128,9 +134,8 @@ class OnnxExtractor:
         # Spinning worker threads would starve the optimizer and the renderer on a small computer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self._multiple = self.info.multiple
-        self._outputs = [
-            f"{kind}_{k}" for k in range(len(self._levels)) for kind in ("features", "confidence")
-        ]
+        kinds = ("learned",) if self.info.orientation else ("features", "confidence")
+        self._outputs = [f"{kind}_{k}" for k in range(len(self._levels)) for kind in kinds]
         width, height = size or (4 * self._multiple, 4 * self._multiple)
         graph = plain_bytes(model, _MOST_BYTES)
         if self._levels != self.info.levels:
@@ -166,7 +171,14 @@ class OnnxExtractor:
         return FeaturePyramid(self._run(self._session, rgb), rgb.shape[1], rgb.shape[0])
 
     def _run(self, session: Session, rgb: Image) -> tuple[FeatureLevel, ...]:
-        arrays = session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
+        rgb = np.ascontiguousarray(rgb)
+        arrays = session.run(self._outputs, {"image": rgb[None]})
+        if self.info.orientation:
+            gray = gray_of(rgb)
+            return tuple(
+                orientation_level(gray, level.stride, learned[0])
+                for level, learned in zip(self._levels, arrays, strict=True)
+            )
         return tuple(
             FeatureLevel(arrays[2 * k][0], arrays[2 * k + 1][0], level.stride)
             for k, level in enumerate(self._levels)

@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose, hat
+from localizer.geometry.pose import Array, Pose
 
 _PASSES = 2  # a point's row decides where it is seen, and so its row
 _LEAST_PX = 0.02  # a sweep that moves nothing by more is none
@@ -48,19 +49,33 @@ class Sweep:
         """
         away = points - world_from_camera.translation
         moved = away
-        turn = hat(self.turn).T
         for _ in range(_PASSES):
-            s = self._share(moved, world_from_camera, camera)
-            turned = away - s * self.way
-            across = turned @ turn
-            moved = turned - s * across + 0.5 * s**2 * (across @ turn)
+            share = self._share(moved, world_from_camera, camera)
+            moved = np.empty_like(away)
+            _move(away, share, self.turn, self.way, moved)
         seen: Array = world_from_camera.translation + moved
         return seen
 
     @staticmethod
     def _share(away: Array, world_from_camera: Pose, camera: Camera) -> Array:
-        """(N, 1) readout time of each point's row: -0.5 for the first to 0.5 for the last."""
+        """(N,) readout time of each point's row: -0.5 for the first to 0.5 for the last."""
         x, y, z = world_from_camera.rotation.T @ away.T
         z = np.where(z > 1e-6, z, np.nan)  # behind the camera: the middle row
         rows = (camera.fy * camera.distorted(x / z, y / z)[1] + camera.cy) / camera.height - 0.5
-        return np.clip(np.nan_to_num(rows), -0.5, 0.5)[:, None]
+        return np.clip(np.nan_to_num(rows), -0.5, 0.5)
+
+
+@njit(cache=True, nogil=True)
+def _move(away, share, turn, way, moved):  # type: ignore[no-untyped-def]
+    """Points after their share of way and turn, to second order in the turn; NumPy takes six times
+    as long.
+    """
+    a, b, c = turn
+    for k in range(len(away)):
+        s = share[k]
+        x, y, z = away[k, 0] - s * way[0], away[k, 1] - s * way[1], away[k, 2] - s * way[2]
+        p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+        half = 0.5 * s * s
+        moved[k, 0] = x - s * p + half * (b * r - c * q)
+        moved[k, 1] = y - s * q + half * (c * p - a * r)
+        moved[k, 2] = z - s * r + half * (a * q - b * p)

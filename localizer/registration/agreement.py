@@ -16,13 +16,8 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.registration.backend import LevelProblem
 from localizer.registration.cpu.algebra import JIT
-from localizer.registration.cpu.reference import (
-    in_view,
-    pose_tangent_map,
-    project,
-    projection_jacobian,
-)
-from localizer.registration.sampling import sample_map
+from localizer.registration.cpu.reference import pose_tangent_map
+from localizer.registration.sampling import numbered, projection_jacobians, seen_anchors
 from localizer.types import Float32
 
 _PART_PX = 16.0  # least side of a part, level px
@@ -170,32 +165,30 @@ def _peaks(sums: Float32) -> Array:
 
 
 def _patch_grid(problem: LevelProblem, rotation: Array, translation: Array) -> _PatchGrid:
-    x, uv = project(problem, rotation, translation)
-    u, v = uv.T
     h, w = problem.confidence.shape
     # The window of every anchor lies in the image, or the image's edge would vote.
-    whole = in_view(problem, x, uv) & (u >= _REACH) & (u < w - 1 - _REACH)
-    whole &= (v >= _REACH) & (v < h - 1 - _REACH)
-    whole[whole] = sample_map(problem.confidence, u[whole], v[whole]) > 0.0  # a picture there
-    x, u, v = x[whole], u[whole], v[whole]
+    seen = seen_anchors(problem, rotation, translation, border=_REACH)
+    shown = seen.confidence > 0.0  # a picture there
+    anchor = seen.anchor[shown]
+    x, u, v, confidence = (values[shown] for values in seen[1:])
     part_px = max(_PART_PX, (h * w * _ANCHORS_A_PART / problem.points.shape[1]) ** 0.5)
     across = int(w // part_px) + 1
     key = (v // part_px).astype(np.int64) * across + (u // part_px).astype(np.int64)
-    names, part = np.unique(key, return_inverse=True)
+    part, count = numbered(key)
     side = 2 * _REACH + 1
-    sums = np.zeros((len(names), side, side), np.float32)
-    weights = problem.anchor_confidence[whole] * sample_map(problem.confidence, u, v)
-    features = np.ascontiguousarray(problem.anchor_features[whole])
+    sums = np.zeros((count, side, side), np.float32)
+    weights = problem.anchor_confidence[anchor] * confidence
+    features = problem.anchor_features[anchor]
     _add(problem.features, features, u, v, weights.astype(np.float32), part, sums)
-    anchors = np.bincount(part, minlength=len(names))
-    tangent = projection_jacobian(problem, x, translation)
+    anchors = np.bincount(part, minlength=count)
+    tangent = projection_jacobians(problem, x, translation)
     inverse = np.linalg.inv(pose_tangent_map(rotation, translation))
     motion = (tangent.reshape(-1, 6) @ inverse).reshape(-1, 2, 6)
     # Ground that lies higher moves in the image as if the camera were lower.
     values = np.concatenate(
-        [motion.reshape(-1, 12), -motion[:, :, 2], problem.points.T[whole, :2]], axis=1
+        [motion.reshape(-1, 12), -motion[:, :, 2], problem.points.T[anchor, :2]], axis=1
     )
-    mean = np.zeros((len(names), 16))
+    mean = np.zeros((count, 16))
     _add_rows(values, part, mean)
     mean /= np.maximum(anchors, 1)[:, None]
     return _PatchGrid(sums, anchors, mean[:, :12].reshape(-1, 2, 6), mean[:, 12:14], mean[:, 14:])

@@ -10,15 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from localizer.geometry.pose import Array, Pose, scaled_inverse
 from localizer.registration.backend import LevelProblem, LMSettings
-from localizer.registration.cpu.reference import (
-    in_view,
-    pose_tangent_map,
-    prior_terms,
-    project,
-    projection_jacobian,
-    robust_loss,
+from localizer.registration.cpu.reference import pose_tangent_map, prior_terms, robust_loss
+from localizer.registration.sampling import (
+    numbered,
+    projection_jacobians,
+    seen_anchors,
+    structure_tensors,
 )
-from localizer.registration.sampling import sample_map, structure_tensors
 
 _LEAST_CURVATURE = 0.03
 
@@ -53,23 +51,20 @@ def anchor_model(
     cell_px: float,
 ) -> AnchorModel:
     """The model of the anchors in view at a pose camera_from_local; cell_px: side of a cell."""
-    x, uv = project(problem, rotation, translation)
-    visible = in_view(problem, x, uv)
-    x, (u, v) = x[visible], uv[visible].T
-    anchors = problem.anchor_features[visible]
-    structure, slope, squares = structure_tensors(problem.features, anchors, u, v)
-    confidence = problem.anchor_confidence[visible] * sample_map(problem.confidence, u, v)
+    seen = seen_anchors(problem, rotation, translation)
+    anchors = problem.anchor_features[seen.anchor]
+    structure, slope, squares = structure_tensors(problem.features, anchors, seen.u, seen.v)
     prior_hessian = np.zeros((6, 6))
     if problem.prior is not None:
         _, prior_hessian, _ = prior_terms(problem.prior, rotation, translation)
     return AnchorModel(
-        projection_jacobian(problem, x, translation),
+        projection_jacobians(problem, seen.x, translation),
         structure,
         slope,
         squares,
-        confidence,
+        problem.anchor_confidence[seen.anchor] * seen.confidence,
         robust_loss(np.sqrt(squares), settings)[1],
-        _cells(u, v, cell_px),
+        _cells(seen.u, seen.v, cell_px),
         cell_px,
         anchors.shape[1],
         prior_hessian,
@@ -79,8 +74,7 @@ def anchor_model(
 def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
     across = int(u.max(initial=0.0) // side) + 1
     key = (v // side).astype(np.int64) * across + (u // side).astype(np.int64)
-    number: NDArray[np.int64] = np.unique(key, return_inverse=True)[1]
-    return number
+    return numbered(key)[0]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings
-from localizer.registration.cpu.reference import in_view, project, robust_loss
-from localizer.registration.sampling import sample_features, sample_map
+from localizer.registration.cpu.reference import robust_loss
+from localizer.registration.sampling import sample_features, seen_anchors
 from localizer.types import Float32
 
 LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit perfectly
@@ -74,11 +74,10 @@ def suppress_duplicates(
 
 def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float32, Array]:
     """Query and anchor features (n, C) and joint weights (n,) of the anchors in view."""
-    x, uv = project(problem, R, t)
-    visible = in_view(problem, x, uv)
-    u, v = uv[visible].T
-    weights = problem.anchor_confidence[visible] * sample_map(problem.confidence, u, v)
-    return sample_features(problem.features, u, v), problem.anchor_features[visible], weights
+    seen = seen_anchors(problem, R, t)
+    query = sample_features(problem.features, seen.u, seen.v)
+    weights = problem.anchor_confidence[seen.anchor] * seen.confidence
+    return query, problem.anchor_features[seen.anchor], weights
 
 
 def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:

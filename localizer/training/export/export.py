@@ -19,6 +19,7 @@ from localizer.training.checkpoint import load_weights, read_checkpoint
 from localizer.training.config import TrainConfig
 from localizer.training.models.networks import Network, build, fuse
 from localizer.training.models.s0 import S0Net
+from localizer.training.models.tiny import TinyNet
 
 OPSET = 17
 _TOLERANCE = 2e-4  # largest difference of a feature between torch and onnxruntime
@@ -46,9 +47,13 @@ class Deployed(nn.Module):
         self._kind = torch.float16 if half else torch.float32
 
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
-        """(1, H, W, 3) uint8 to features (1, h, w, C) and confidence (1, h, w) per level."""
-        levels = self.network(image.permute(0, 3, 1, 2).to(self._kind) / 255.0)
-        return tuple(t for f, c in levels for t in (f.permute(0, 2, 3, 1), c))
+        """(1, H, W, 3) uint8 to features (1, h, w, C) and confidence (1, h, w) per level; of
+        `tiny` to what `orientation_level` needs, (1, h, w, C - 7) per level.
+        """
+        planes = image.permute(0, 3, 1, 2).to(self._kind) / 255.0
+        if isinstance(self.network, TinyNet):
+            return tuple(f.permute(0, 2, 3, 1) for f in self.network.learned(planes))
+        return tuple(t for f, c in self.network(planes) for t in (f.permute(0, 2, 3, 1), c))
 
 
 def load_network(checkpoint: Path) -> tuple[Network, TrainConfig, dict[str, object]]:
@@ -78,11 +83,10 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
     network, config, progress = load_network(checkpoint)
     if half and not isinstance(network, S0Net):
         raise ModelError(f"{checkpoint}: float16 is for s0; tiny's fixed channels need float32")
-    exact = Deployed(fuse(network)).eval()
-    deployed = Deployed(copy.deepcopy(network), half=True).eval() if half else exact
-    names = [
-        f"{kind}_{k}" for k in range(len(network.strides)) for kind in ("features", "confidence")
-    ]
+    exact = fuse(network).eval()
+    deployed = Deployed(copy.deepcopy(exact) if half else exact, half=half).eval()
+    kinds = ("learned",) if isinstance(network, TinyNet) else ("features", "confidence")
+    names = [f"{kind}_{k}" for k in range(len(network.strides)) for kind in kinds]
     axes = {"image": {1: "height", 2: "width"}}
     axes |= {name: {1: f"h{name[-1]}", 2: f"w{name[-1]}"} for name in names}
     model.parent.mkdir(parents=True, exist_ok=True)
@@ -103,6 +107,7 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
             "name": f"{config.name}-float16" if half else config.name,
             "sha256": hashlib.sha256(made.read_bytes()).hexdigest(),
             "levels": [{"stride": s, "channels": config.model.channels} for s in network.strides],
+            "orientation": isinstance(network, TinyNet),
             "parameters": sum(p.numel() for p in network.parameters()),
             "training": {
                 "seed": config.seed,
@@ -126,18 +131,17 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
     return parity
 
 
-def check_parity(deployed: Deployed, model: Path, *, half: bool = False) -> Parity:
+def check_parity(network: nn.Module, model: Path, *, half: bool = False) -> Parity:
     """Compare onnxruntime with torch in float32 on an image of another size; ModelError if they
     differ by more than rounding explains. Both compute on the CPU: CUDA rounds products to TF32.
     """
     image = np.random.default_rng(0).integers(0, 256, (120, 168, 3), dtype=np.uint8)
     pyramid = OnnxExtractor(model, threads=1, only="CPU").extract(image)
     with torch.no_grad():
-        expected = [value[0].numpy() for value in deployed(torch.from_numpy(image[None]))]
+        expected = network(torch.from_numpy(image[None]).permute(0, 3, 1, 2).float() / 255.0)
     worst, cosines = 0.0, []
-    for level, features, confidence in zip(
-        pyramid.levels, expected[::2], expected[1::2], strict=True
-    ):
+    for level, (f, c) in zip(pyramid.levels, expected, strict=True):
+        features, confidence = f[0].permute(1, 2, 0).numpy(), c[0].numpy()
         worst = max(worst, float(np.abs(level.features - features).max()))
         worst = max(worst, float(np.abs(level.confidence - confidence).max()))
         cosines.append(float((level.features * features).sum(-1).mean()))

@@ -1,4 +1,4 @@
-"""The gradient fallback's features as a fixed part of the network: `GradientExtractor` in torch.
+"""The gradient fallback's features as a fixed part of the network: `orientation_level` in torch.
 
 They give the network a sound basin from the first step on, so that what is learned is what they
 lack: what survives a change of season and light, and what to trust.
@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-ORIENTATIONS = 7
-CHANNELS = ORIENTATIONS + 1
+from localizer.features.orientation import ORIENTATIONS
 
 
 class OrientationFeatures(nn.Module):

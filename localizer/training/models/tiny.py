@@ -20,7 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from localizer.training.models.orientation import CHANNELS, OrientationFeatures
+from localizer.features.orientation import CHANNELS
+from localizer.training.models.orientation import OrientationFeatures
 
 STRIDES = (8, 4, 2)
 
@@ -106,20 +107,33 @@ class TinyNet(nn.Module):
 
     def forward(self, image: Tensor) -> list[tuple[Tensor, Tensor]]:
         """See the class."""
+        levels = []
+        for k, x in enumerate(self.learned(image)):
+            oriented, clear = self.orientation[k](image)
+            f = x[:, 1:]
+            unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
+            share = torch.sigmoid(x[:, :1])
+            both = torch.cat([torch.sqrt(share) * oriented, torch.sqrt(1 - share) * unit], 1)
+            levels.append((both, clear))
+        return levels
+
+    def learned(self, image: Tensor) -> list[Tensor]:
+        """The levels (B, 1 + n, h, w) of `orientation_level`: the logit of the orientation's share
+        and the learned features, of any length.
+        """
         a = self.stem((image - 0.45) / 0.25)
         b = self.stage2(a)
         c = self.stage3(b)
         d = self.merge1(F.relu(self.lateral1(b) + _double(self.down1(c))))
         e = self.merge2(F.relu(self.lateral2(a) + _double(self.down2(d))))
-        levels = []
-        for k, x in enumerate((c, d, e)):
-            oriented, clear = self.orientation[k](image)
-            f = self.features[k](x).float()
-            unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
-            share = torch.sigmoid(self.share[k](x).float())
-            both = torch.cat([torch.sqrt(share) * oriented, torch.sqrt(1 - share) * unit], 1)
-            levels.append((both, clear))
-        return levels
+        heads = zip(self.share, self.features, (c, d, e), strict=True)
+        return [_joined(share, features, x).float() for share, features, x in heads]
+
+
+def _joined(first: nn.Module, second: nn.Module, x: Tensor) -> Tensor:
+    """The outputs of two convolutions 1 x 1, of one: it reads the input once."""
+    weight = torch.cat([first.weight, second.weight])
+    return F.conv2d(x, weight, torch.cat([first.bias, second.bias]))
 
 
 def fused_convolution(

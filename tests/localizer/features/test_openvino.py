@@ -91,7 +91,7 @@ def test_callers_on_several_threads_have_results_of_their_own():
     pictures = [image(seed)[None] for seed in range(8)]
 
     def features(picture: np.ndarray) -> np.ndarray:
-        found: np.ndarray = session.run(["features_2"], {"image": picture})[0]
+        found: np.ndarray = session.run(["learned_2"], {"image": picture})[0]
         return found
 
     one_by_one = [features(picture) for picture in pictures]
@@ -110,7 +110,7 @@ def test_it_tells_its_maker_nothing():
         "e.startswith('socket.') else None); "
         "from localizer.features.openvino_session import OpenVinoSession as S; "
         f"S(open({str(SHIPPED_MODEL)!r}, 'rb').read(), 1)"
-        ".run(['confidence_0'], {'image': numpy.zeros((1, 32, 32, 3), numpy.uint8)}); "
+        ".run(['learned_0'], {'image': numpy.zeros((1, 32, 32, 3), numpy.uint8)}); "
         "assert threading.active_count() == 1, threading.enumerate()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, text=True)
@@ -120,7 +120,7 @@ def test_it_tells_its_maker_nothing():
 # --- A network cut to some of its outputs computes the same there, and nothing for the others ---
 
 
-COARSE = ["features_0", "confidence_0", "features_1", "confidence_1"]
+COARSE = ["learned_0", "learned_1"]
 
 
 def picture(side: int = 128) -> np.ndarray:
@@ -138,7 +138,7 @@ def cpu_seconds(extractor, rgb) -> float:
 
 def test_the_levels_that_stay_are_the_same_bit_by_bit_and_cost_half():
     whole, coarse = load_extractor(threads=1), load_extractor(threads=1, finest=4)
-    rgb = picture()
+    rgb = picture(256)
     kept = coarse.extract(rgb).levels
     assert [level.stride for level in kept] == [8, 4]
     for level, same in zip(kept, whole.extract(rgb).levels[:2], strict=True):

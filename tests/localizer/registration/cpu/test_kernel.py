@@ -18,17 +18,21 @@ from localizer.registration.backend import (
     camera_from_local,
     level_problems,
     local_origin,
+    sample_bilinear,
     world_from_camera,
 )
 from localizer.registration.cpu.kernel import NumbaBackend, refine_kernel
 from localizer.registration.cpu.reference import (
     ReferenceBackend,
+    in_view,
     linearize,
     pose_tangent_map,
     project,
+    projection_jacobian,
     retract,
 )
 from localizer.registration.hypotheses import generate_hypotheses
+from localizer.registration.sampling import projection_jacobians, seen_anchors
 
 SETTINGS = LMSettings()
 # A busy machine is no reason to fail.
@@ -60,6 +64,28 @@ def test_projection_of_anchors_meets_their_pixels(scene, problems):
     for problem, level in zip(levels, scene.query.levels, strict=True):
         _, uv = project(problem, R, t)
         np.testing.assert_allclose((uv + 0.5) * level.stride, scene.anchors.pixels, atol=2e-3)
+
+
+@pytest.mark.parametrize("border", [0, 6])
+def test_compiled_projection_is_the_references(problems, swarm, border):
+    """At poses from which some anchors are out of view."""
+    problem = problems[1][2]
+    h, w = problem.confidence.shape
+    for R, t in zip(*swarm, strict=True):
+        x, uv = project(problem, R, t)
+        inside = in_view(problem, x, uv) & (uv >= border).all(axis=1)
+        inside &= (uv < np.array([w, h]) - 1 - border).all(axis=1)
+        seen = seen_anchors(problem, R, t, border)
+        np.testing.assert_array_equal(seen.anchor, np.flatnonzero(inside))
+        np.testing.assert_allclose(seen.x, x[inside], atol=1e-9)
+        np.testing.assert_allclose(np.stack([seen.u, seen.v], axis=1), uv[inside], atol=1e-9)
+        confidence = sample_bilinear(problem.confidence, *uv[inside].T)
+        np.testing.assert_allclose(seen.confidence, confidence, atol=1e-6)
+        np.testing.assert_allclose(
+            projection_jacobians(problem, seen.x, t),
+            projection_jacobian(problem, x[inside], t), rtol=1e-9, atol=1e-9,
+        )  # fmt: skip
+    assert not inside.all()
 
 
 def test_feature_jacobians_are_autograds(scene, problems):
