@@ -463,9 +463,11 @@ def _engine(context: Assembly) -> DualThreadEngine:
         lambda time_ns: memory.prior(time_ns) or autopilot.prior(time_ns),
         context[PlaceSearch].search,
     )
+    keep = context[PlaceSearch].keep
     table, bridge = context.config.camera.zoom, context[Bridge]
     if table is None:
         channels.frames.subscribe(engine.submit)
+        channels.frames.subscribe(keep)
         return engine
     zoomed = ZoomedFrames(table, bridge.zoom_at, bridge.report_alert)
 
@@ -473,6 +475,7 @@ def _engine(context: Assembly) -> DualThreadEngine:
         known = zoomed(frame)
         if known is not None:
             engine.submit(known)
+            keep(known)
 
     channels.frames.subscribe(submit)
     channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))

@@ -20,8 +20,9 @@ from localizer.errors import LocalizerError
 from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
-from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
-from localizer.relocalization.types import PlaceQuery, Relocalization, SearchRegion
+from localizer.pictures import shrink
+from localizer.relocalization.relocalizer import SEARCH_WIDTH, OpenRelocalizer, open_relocalizer
+from localizer.relocalization.types import EarlierFrame, PlaceQuery, Relocalization, SearchRegion
 from localizer.sensors.error_model import SENSORS
 from localizer.types import Frame, PosePrior
 from mavlink_bridge.alerts.ids import AlertId
@@ -33,6 +34,7 @@ _HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
 _STOP_S = 10.0
 _WHOLE_MAP_EVERY = 5  # searches
+_KEPT, _KEPT_EVERY_S = 10, 1.0  # frames to be laid together
 _NEWS_S = 2.0  # for which the last search tells what is missing
 
 # What the autopilot knows of the camera while it does not know where it is.
@@ -105,6 +107,7 @@ class RelocalizationHypothesis:
             height_m=float(pose.translation[2]) + query.height_m - self.query.height_m,
             height_sigma_m=min(late * _FOLLOWED_HEIGHT_M, _HEIGHT_SIGMA_M),
             region=SearchRegion.circle(pose.translation[:2] + way, _FOLLOWED_M + sigma_m),
+            earlier=(),
         )
 
     def velocity_to(self, later: Relocalization) -> Array | None:
@@ -128,6 +131,10 @@ def _on_plane(query: PlaceQuery) -> PlaceQuery:
         return query
     away = query.region.centre
     return replace(query, height_m=query.height_m - 0.5 * float(away @ away) / EARTH_RADIUS_M)
+
+
+def _seconds(before: Frame, after: Frame) -> float:
+    return (after.exposure_time_ns - before.exposure_time_ns) * 1e-9
 
 
 def _radius_m(circle: SearchRegion) -> float:
@@ -177,6 +184,8 @@ class PlaceSearch:
         self._autopilot, self._event, self._reach = autopilot, event, reachable
         self._in_reach = 0  # searches since the whole map was searched
         self._hint: tuple[SearchRegion, float] | None = None  # the operator's, and when it came
+        self._kept: tuple[tuple[Frame, Array, float], ...] = ()  # rotation, height; newest first
+        self._lays_together = False  # at the last search, if not near a place
         self._open: OpenRelocalizer | None = None
         self._obstacle: AlertId | None = AlertId.SEARCH_NOT_READY
         self._without_pose_s = -math.inf  # when attitude or height was missing last
@@ -227,6 +236,24 @@ class PlaceSearch:
         self._event("info", f"search about {at[0]:.0f} m east, {at[1]:.0f} m north: operator")
         return True
 
+    def keep(self, frame: Frame) -> None:
+        """Keep one frame a second, small, for the next searches. Called for each frame, on the
+        thread of the video.
+        """
+        if self._kept and _seconds(self._kept[0][0], frame) < _KEPT_EVERY_S:
+            return
+        rotation = self._autopilot.rotation(frame.exposure_time_ns)
+        height_m = self._autopilot.height_m
+        if rotation is None or height_m is None:
+            return
+        width = min(SEARCH_WIDTH, frame.camera.width)
+        camera = frame.camera.resized(
+            width, round(width * frame.camera.height / frame.camera.width)
+        )
+        image = shrink(frame.image, (camera.width, camera.height))
+        small = replace(frame, image=image, camera=camera)
+        self._kept = ((small, rotation, height_m), *self._kept[: _KEPT - 1])
+
     def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
         """The camera's pose at the frame's exposure, as a hypothesis; takes seconds. None until the
         map's overview is open, without the autopilot's attitude or height, without a clear result,
@@ -243,6 +270,10 @@ class PlaceSearch:
             seen = None  # the operator knows it since
         velocity, about = self._autopilot.velocity, self._reach(frame.exposure_time_ns)
         predicted = seen.predicted_query(query, velocity, about) if seen is not None else None
+        if predicted is None:
+            # Every second time of one frame: relief or dirt may lay them together wrongly.
+            self._lays_together = not self._lays_together
+            query = query if self._lays_together else replace(query, earlier=())
         began = self._clock()
         found = self._open.relocalizer.find(predicted or _on_plane(query), should_stop)
         near = seen if predicted is not None else None
@@ -276,6 +307,11 @@ class PlaceSearch:
             self._without_pose_s = self._clock()
             return None
         self._without_pose_s = -math.inf
+        earlier = (
+            EarlierFrame(kept, then, was_m - height_m)
+            for kept, then, was_m in self._kept
+            if 0.0 < _seconds(kept, frame) < _KEPT * 1.5 * _KEPT_EVERY_S
+        )
         return PlaceQuery(
             frame,
             rotation,
@@ -284,6 +320,7 @@ class PlaceSearch:
             height_m,
             _HEIGHT_SIGMA_M,
             self.region(frame.exposure_time_ns),
+            tuple(earlier),
         )
 
     def region(self, time_ns: int) -> SearchRegion | None:

@@ -256,6 +256,7 @@ class _Player:
         self._last_ns = frame.exposure_time_ns
         self._counts.frames += 1
         self._parts.channels.frames.send(frame)
+        self._search.keep(frame)
         try:
             estimate = self._estimate(frame)
         except (OutsideMapError, MapLoadingError) as error:

@@ -19,6 +19,7 @@ class RelocalizationConfig:
     scale_step: float = 1.1  # ratio of neighbouring heights above ground
     extraction_ratio: float = 1.35  # ratio of heights that share one feature extraction
     patch_m: float = 128.0  # largest side of the compared ground, at 0.5 m a pixel
+    strip_m: float = 340.0  # largest side of the ground of several frames, 120 m above it
     candidates: int = 96  # largest number of candidates rendered at half size
     finalists: int = 4  # of these, the number that is registered
     passes: int = 3  # renderings of a candidate, each from the last pose

@@ -135,8 +135,8 @@ class LevelCorrelator:
         apart: int = ORIGIN_CELLS,
     ) -> list[Float32]:
         """Scores (n, n) of each pair: number of a patch, and the block. At most `PATCHES_TOGETHER`
-        patches and `BLOCKS_TOGETHER` different blocks. apart: cells between compared origins,
-        `ORIGIN_CELLS` or `ROUGH_CELLS`.
+        patches and `BLOCKS_TOGETHER` different blocks, of one size. apart: cells between compared
+        origins, `ORIGIN_CELLS` or `ROUGH_CELLS`.
         """
         blocks = {b: k for k, b in enumerate(dict.fromkeys(b for _, b in pairs))}
         spectra = [self.prepare(b) for b in blocks]
@@ -148,21 +148,20 @@ class LevelCorrelator:
             np.array([(blocks[b], n, at) for at, (n, b) in enumerate(pairs)], np.int64),
             products.view(np.float32),
         )
+        side = pairs[0][1].step // apart
+        # Only the first rows are origins: the others' last transform is left out.
+        columns = scipy.fft.ifft(products, axis=1, workers=1, overwrite_x=True)[:, :side]
+        raws = scipy.fft.irfft(columns, n, axis=2, workers=1)
+        below = np.stack([spectra[blocks[b]].energy * patches[k].mask.conj() for k, b in pairs])
+        energies = scipy.fft.irfft2(below, (SIZE // _COARSE,) * 2, workers=1)
         return [
-            self._normalised(product, spectra[blocks[b]], patches[n], b.step // apart)
-            for product, (n, b) in zip(products, pairs, strict=True)
+            self._normalised(raw, energy, patches[k])
+            for raw, energy, (k, _) in zip(raws, energies, pairs, strict=True)
         ]
 
-    def _normalised(
-        self, product: Complex64, block: _Spectra, patch: PatchSpectra, side: int
-    ) -> Float32:
-        """Scores (side, side) from the product (n, n // 2 + 1), which is overwritten."""
-        n = product.shape[0]
-        # Only the first rows are origins: the others' last transform is left out.
-        columns = scipy.fft.ifft(product, axis=0, workers=1, overwrite_x=True)[:side]
-        raw = scipy.fft.irfft(columns, n, axis=1, workers=1)
-        small = SIZE // _COARSE
-        energy = scipy.fft.irfft2(block.energy * patch.mask.conj(), (small, small), workers=1)
+    def _normalised(self, raw: Float32, energy: Float32, patch: PatchSpectra) -> Float32:
+        """Scores (side, side) of the raw ones (side, n)."""
+        side, n = raw.shape
         least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
         scores = np.empty((side, side), np.float32)
         norm = max(patch.norm, 1e-9) * (2 * _LOW / n) ** 2  # fewer frequencies: a smaller divisor

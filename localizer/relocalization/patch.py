@@ -88,7 +88,8 @@ def rectify(
     gsd_m: float,
 ) -> Patch:
     """Rectify a pinhole image (H, W, 3) to the square of ground about `centre` (2,), m east and
-    north of the point below the camera; row 0 is in the north.
+    north of the point below the camera; row 0 is in the north. A fourth channel of the image is 255
+    where it shows the ground.
 
     rotation: (3, 3) world_from_camera; height_m: above the ground, which is assumed to be flat.
     Ground outside the image gets the image's mean colour.
@@ -109,6 +110,8 @@ def rectify(
     seen &= (v > _BORDER_PX) & (v < camera.height - _BORDER_PX)
     half = np.float32(0.5)
     rgb = cv2.remap(image, u - half, v - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if image.shape[2] == 4:
+        rgb, seen = rgb[..., :3], seen & (rgb[..., 3] == 255)
     mean = np.asarray(cv2.mean(image)[:3])
     rgb[~seen] = np.rint(mean).astype(np.uint8)
     return Patch(rgb.astype(np.uint8, copy=False), seen, centre)

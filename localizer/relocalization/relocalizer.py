@@ -26,15 +26,28 @@ from localizer.relocalization.align import FrameShift
 from localizer.relocalization.confirm import Confirmation, competitors
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import STRIDE, MapOverview, Progress, open_overview
-from localizer.relocalization.search import SearchView, above_roofs, search
-from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
+from localizer.relocalization.search import (
+    LEAST_HEIGHT_M,
+    SearchView,
+    above_roofs,
+    ground_of,
+    search,
+)
+from localizer.relocalization.strip import GroundStrip, GroundView, lay_together
+from localizer.relocalization.types import (
+    EarlierFrame,
+    PlaceCandidate,
+    PlaceQuery,
+    Relocalization,
+)
 from localizer.relocalization.verdict import VerifiedCandidate, decide
 from localizer.relocalization.verify import QueryFeatures, Verifier
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Undistorter, working_camera
+from localizer.types import Frame, Image
 
-_SEARCH_WIDTH = 480  # px of the frame that the ground is rectified from
+SEARCH_WIDTH = 480  # px of the frame that the ground is rectified from
 _SCREEN_WIDTH = 160  # px, at which all candidates are rendered
 _BLUR_PX = 0.6  # the map is sampled more coarsely than the frame
 # Grey levels (sigma) without fine noise. A covered lens has 0.5 and kept a busy computer searching
@@ -72,7 +85,7 @@ class Relocalizer:
             renderer, self._detail, coarse, optimizer, self._config, config.integrity,
             height_sigma_m, config.anchors, config.seed,
         )  # fmt: skip
-        budget = self._config.spectra_mib * 2**20
+        budget = self._config.spectra_mib * 2**20 // 2  # a frame's level, and a strip's
         self._correlators = tuple(LevelCorrelator(x, budget) for x in overview.levels)
         for correlator in self._correlators:
             correlator.warm_up()
@@ -115,15 +128,14 @@ class Relocalizer:
         """The most similar positions, in the order of `search.search`; empty if cancelled, without
         any, and for a frame without contrast (covered lens).
         """
-        camera = working_camera(query.frame.camera, min(_SEARCH_WIDTH, query.frame.camera.width))
-        image = cv2.GaussianBlur(self._undistorted(query, camera), (0, 0), _BLUR_PX)
+        image, camera = self._ground_image(query.frame)
         if (
             float(cv2.GaussianBlur(image, (0, 0), _COARSE_PX).std(axis=(0, 1)).max())
             < _LEAST_CONTRAST
         ):
             return []
-        view = SearchView(image.astype(np.uint8, copy=False), camera)
         over = above_roofs(query, self.overview.levels[0], self._missing_m, self._config)
+        view = SearchView(image, camera, lambda: self._strip(over))
         threads = self._config.threads
         pool = ThreadPoolExecutor(threads, "place-search") if threads > 1 else None
         try:
@@ -135,6 +147,28 @@ class Relocalizer:
             if pool is not None:
                 pool.shutdown(cancel_futures=True)
         return found or []
+
+    def _ground_image(self, frame: Frame) -> tuple[Image, Camera]:
+        """What the ground is rectified from, and its pinhole."""
+        camera = working_camera(frame.camera, min(SEARCH_WIDTH, frame.camera.width))
+        image = cv2.GaussianBlur(self._undistorted(frame, camera), (0, 0), _BLUR_PX)
+        return image.astype(np.uint8, copy=False), camera
+
+    def _strip(self, query: PlaceQuery) -> GroundStrip | None:
+        """The query's frame and the earlier ones laid together; None without any."""
+        if not query.earlier:
+            return None
+        ground = float(np.nanmedian(ground_of(self.overview.levels[0], query)))
+        above = max(query.height_m - ground, LEAST_HEIGHT_M)
+        now = EarlierFrame(query.frame, query.rotation, 0.0)
+        views = [
+            GroundView(*self._ground_image(x.frame), x.rotation, above + x.higher_m)
+            for x in (now, *query.earlier)
+        ]
+        larger = max(1.0, above / 120.0)
+        return lay_together(
+            views, larger * self._config.strip_m, larger * self.overview.levels[0].gsd_m
+        )
 
     def verify(
         self,
@@ -152,20 +186,20 @@ class Relocalizer:
         """The frame's features at the tracker's size, and at the smaller size of the screening."""
         camera = working_camera(query.frame.camera, self._width)
         small = working_camera(query.frame.camera, min(_SCREEN_WIDTH, self._width))
-        features = self._detail.extract(self._undistorted(query, camera))
-        few = self.extractor.extract(self._undistorted(query, small))
+        features = self._detail.extract(self._undistorted(query.frame, camera))
+        few = self.extractor.extract(self._undistorted(query.frame, small))
         return (
             QueryFeatures(camera, features, FrameShift(features.levels)),
             QueryFeatures(small, few, FrameShift(few.levels)),
         )
 
-    def _undistorted(self, query: PlaceQuery, camera: Camera) -> np.ndarray:
-        key = (query.frame.camera, camera.width)
+    def _undistorted(self, frame: Frame, camera: Camera) -> np.ndarray:
+        key = (frame.camera, camera.width)
         if key not in self._undistorters:
             if len(self._undistorters) >= _MOST_UNDISTORTERS:  # a camera that zooms
                 self._undistorters.clear()
-            self._undistorters[key] = Undistorter(query.frame.camera, camera)
-        return self._undistorters[key](query.frame)
+            self._undistorters[key] = Undistorter(frame.camera, camera)
+        return self._undistorters[key](frame)
 
 
 class OpenRelocalizer:

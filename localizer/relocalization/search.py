@@ -1,7 +1,8 @@
 """Exhaustive search over headings, heights above ground, and positions of the region.
 
 If there is much to compare, every pair of a trial (heading and height) and a block of the map is
-compared roughly first, and only the best pairs at the origins between them.
+compared roughly first, and only the best pairs at the origins between them. The rough pass compares
+the strip of the last seconds with a coarser level, if it is large enough for one.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ from localizer.relocalization.patch import (
     rectify,
     with_heading,
 )
+from localizer.relocalization.strip import GroundStrip
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
+from localizer.render.topview import DOWN
 from localizer.types import Float32, Image
 
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
@@ -56,7 +59,7 @@ Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 _MOST_PX = MOST_CELLS * STRIDE  # of a patch's side
 _UNSEEN_PX = 9  # next to what is not seen, features are of the filling
 _SUPPRESSED_M = 12.0  # about a candidate, whose neighbours are no other place
-_LEAST_HEIGHT_M = 10.0
+LEAST_HEIGHT_M = 10.0
 _MOST_PAIRS = 512  # of a trial and a block that are compared at every `ORIGIN_CELLS`th origin
 _HEADINGS_TOGETHER = 3  # that share an extraction: its features are turned by up to 6 degrees
 _AT = np.arange(-3.0, 4.0) - np.array([[-0.5], [0.0], [0.5]])
@@ -65,10 +68,13 @@ _TAPS = np.sinc(_AT) * np.sinc(_AT / 3) * (np.abs(_AT) < 3)  # Lanczos: half a s
 
 @dataclass(frozen=True)
 class SearchView:
-    """The frame for the search: image (H, W, 3) of a pinhole camera."""
+    """The frame for the search: image (H, W, 3) of a pinhole camera, or (H, W, 4) as a strip's.
+    strip: this frame and earlier ones laid together; called before a rough pass.
+    """
 
     image: Image
     camera: Camera
+    strip: Callable[[], GroundStrip | None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -116,7 +122,7 @@ def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
         return level.ground
     above = query.height_m + query.height_sigma_m - float(np.nanmin(level.ground))
     low, high = query.region.bounds
-    reach = FARTHEST * max(above, _LEAST_HEIGHT_M)
+    reach = FARTHEST * max(above, LEAST_HEIGHT_M)
     cell = level.cell_m * GROUND_CELLS
     north, south = level.north - high[1] - reach, level.north - low[1] + reach
     west, east = low[0] - reach - level.west, high[0] + reach - level.west
@@ -137,7 +143,7 @@ def trial_heights(query: PlaceQuery, ground: Float32, config: RelocalizationConf
         return np.empty(0)
     low = query.height_m - query.height_sigma_m - float(known.max())
     high = query.height_m + query.height_sigma_m - float(known.min())
-    low, high = max(low, _LEAST_HEIGHT_M), max(high, _LEAST_HEIGHT_M)
+    low, high = max(low, LEAST_HEIGHT_M), max(high, LEAST_HEIGHT_M)
     count = max(1, math.ceil(math.log(high / low) / math.log(config.scale_step)))
     edges = np.geomspace(low, high, count + 1)
     result: Array = np.sqrt(edges[:-1] * edges[1:])
@@ -190,11 +196,10 @@ def search(
         return []
     largest = config.patch_m * max(1.0, float(np.median(heights)) / 120.0)
     seen = footprint(view.camera, query.rotation, 1.0, largest / float(heights[-1]))
-    level = level_for(tuple(c.level for c in correlators), seen.side_m * float(heights[0]))
-    correlator = next(c for c in correlators if c.level is level)
-    run = _MapSearch(view, query, correlator, extractor, config, seen, heights, ())
-    run = replace(run, blocks=tuple(correlator.blocks(run.cells(float(heights[-1])))))
-    run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
+    levels = tuple(c.level for c in correlators)
+    level = level_for(levels, seen.side_m * float(heights[0]))
+    correlator = correlators[levels.index(level)]
+    run = _MapSearch(view, query, correlator, extractor, config, seen, heights, ()).prepared()
 
     def each(work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
         def one(item: Any) -> Any:
@@ -204,8 +209,20 @@ def search(
 
         return map(one, items) if pool is None else pool.map(one, items)
 
+    def coarser() -> _MapSearch | None:
+        strip = view.strip()
+        if strip is None:
+            return None
+        wanted = level_for(levels, strip.seen.side_m * float(np.median(heights)))
+        if wanted.gsd_m <= level.gsd_m:
+            return None
+        return _MapSearch(
+            SearchView(strip.image, strip.camera), replace(query, rotation=DOWN),
+            correlators[levels.index(wanted)], extractor, config, strip.seen, heights, (),
+        ).prepared()  # fmt: skip
+
     try:
-        return run.found(each)
+        return run.found(each, coarser)
     except _CancelledError:
         return None
 
@@ -270,6 +287,19 @@ class PairScores:
     scores: Float32
 
 
+@dataclass(frozen=True)
+class RoughPair:
+    """A trial and a block, compared roughly. power: as `PairScores`; best: the highest of its
+    scores, and at: its index among them.
+    """
+
+    trial: Trial
+    block: Block
+    power: float
+    best: float
+    at: int
+
+
 def trial_noise(trials: Sequence[Trial], power: Iterable[Sequence[Any]]) -> Array:
     """Root mean square (n,) of each trial's scores over ground. Trials are compared by score
     divided by noise: low above a hill few cells are seen, and some position always looks similar.
@@ -311,37 +341,93 @@ class _MapSearch:
         shape = tuple(-(-(n + 2 * self.lead) // ORIGIN_CELLS) for n in (rows, columns))
         return Scores(np.full(shape, -1.0, np.float32), np.zeros(shape, np.int32))
 
-    def found(self, each: Each) -> list[PlaceCandidate]:
-        """The search's result."""
-        jobs = self.jobs()
-        patches = each(self.patch, [middle for middle, _ in jobs])
-        looks = [
-            Look(of, features, mask, trials)
-            for (of, trials), (features, mask) in zip(jobs, patches, strict=True)
-        ]
+    def prepared(self) -> _MapSearch:
+        """With its blocks and their suited origins."""
+        blocks = self.correlator.blocks(self.cells(float(self.heights[-1])))
+        run = replace(self, blocks=tuple(blocks))
+        return replace(run, suited=tuple(run.suited_at(k) for k in range(len(self.heights))))
+
+    def found(
+        self, each: Each, coarser: Callable[[], _MapSearch | None]
+    ) -> list[PlaceCandidate]:  # fmt: skip
+        """The search's result. coarser: the search of a strip, None without."""
+        looks = self.looks(each)
         trials = [trial for look in looks for trial in look.trials]
         if not trials:
             return []
         wanted = [trial.blocks for trial in trials]
-        rough: list[tuple[int, float, float, Block]] = []
+        noise: Array | None = None
         if sum(map(len, wanted)) > 4 * _MOST_PAIRS:  # below, a rough pass saves nothing
-            rough = [
-                (p.trial, p.power, float(p.scores.max()), p.block)
-                for p in self.compare(looks, wanted, ROUGH_CELLS, each)
-            ]
-            noise = trial_noise(trials, rough)
-            wanted = [{} for _ in trials]
-            for n, _, _, block in heapq.nlargest(
-                _MOST_PAIRS, rough, key=lambda x: x[2] / noise[x[0]]
-            ):
-                wanted[n][block] = trials[n].blocks[block]
+            strip = coarser()
+            if strip is None:
+                noise, rough = self.rough(looks, each)
+                wanted = [{} for _ in trials]
+                for best in rough:
+                    wanted[best.trial.number][best.block] = best.trial.blocks[best.block]
+            else:
+                noise, wanted = self.under(strip, trials, each)
         pairs = list(self.compare(looks, wanted, ORIGIN_CELLS, each))
-        if not rough:
+        if noise is None:
             noise = trial_noise(trials, [(p.trial, p.power) for p in pairs])
         scores = self.empty()
         for pair in pairs:
             self.merge(scores, pair, float(noise[pair.trial]))
         return self.candidates(scores, trials, noise)
+
+    def looks(self, each: Each) -> list[Look]:
+        jobs = self.jobs()
+        patches = each(self.patch, [middle for middle, _ in jobs])
+        return [
+            Look(of, features, mask, trials)
+            for (of, trials), (features, mask) in zip(jobs, patches, strict=True)
+        ]
+
+    def rough(self, looks: Sequence[Look], each: Each) -> tuple[Array, list[RoughPair]]:
+        """Noise of each trial, and the pairs that are most alike."""
+        trials = [trial for look in looks for trial in look.trials]
+        pairs = []
+        for p in self.compare(looks, [t.blocks for t in trials], ROUGH_CELLS, each):
+            at = int(np.argmax(p.scores))
+            best = float(p.scores.flat[at])
+            pairs.append(RoughPair(trials[p.trial], p.block, p.power, best, at))
+        noise = trial_noise(trials, [(p.trial.number, p.power) for p in pairs])
+        most = heapq.nlargest(_MOST_PAIRS, pairs, key=lambda p: p.best / noise[p.trial.number])
+        return noise, most
+
+    def under(
+        self, strip: _MapSearch, trials: Sequence[Trial], each: Each
+    ) -> tuple[Array, list[dict[Block, SuitedOrigins]]]:
+        """Noise of each trial, and the origins about its best places, both by a strip."""
+        reach = 2 * ROUGH_CELLS * strip.correlator.level.cell_m / self.correlator.level.cell_m
+        looks = strip.looks(each)
+        theirs, rough = strip.rough(looks, each)
+        mine: dict[float, list[Trial]] = {}
+        for trial in trials:
+            mine.setdefault(trial.of.heading_rad, []).append(trial)
+        noise = np.full(len(trials), theirs.mean())
+        for other in (trial for look in looks for trial in look.trials):
+            for trial in mine.get(other.of.heading_rad, ()):
+                if trial.of.height_m == other.of.height_m:
+                    noise[trial.number] = theirs[other.number]
+        wanted: list[dict[Block, SuitedOrigins]] = [{} for _ in trials]
+        for pair in rough:
+            corner = np.array([pair.block.row, pair.block.column])
+            at = corner + ROUGH_CELLS * np.array(divmod(pair.at, pair.block.step // ROUGH_CELLS))
+            place = strip.camera_at(at, pair.trial.of)
+            # At every height, for the strip's middle may lie higher or lower than the frame.
+            for trial in mine.get(pair.trial.of.heading_rad, ()):
+                found, origin = wanted[trial.number], self.origin_of(place, trial.of)
+                for block, suited in trial.blocks.items():
+                    row, column = origin[0] - block.row, origin[1] - block.column
+                    if min(row, column) < -reach or max(row, column) > block.step + reach:
+                        continue
+                    middles = np.arange(GROUND_CELLS / 2, block.step, GROUND_CELLS)
+                    near = np.outer(abs(middles - row) <= reach, abs(middles - column) <= reach)
+                    near &= suited.mask
+                    if near.any():
+                        mask = near | found[block].mask if block in found else near
+                        found[block] = replace(suited, mask=mask)
+        return noise, wanted
 
     def jobs(self) -> list[tuple[Rectification, tuple[Trial, ...]]]:
         """What is extracted, and the trials that share it."""
@@ -403,7 +489,8 @@ class _MapSearch:
                 scores = self.correlator.correlate_all(patches, pairs, apart)
                 for (n, block), raw in zip(pairs, scores, strict=True):
                     power = float(np.vdot(raw, raw)) / raw.size
-                    masked = self.masked(raw, block, some[n], apart)
+                    suited = wanted[some[n].number][block]
+                    masked = self.masked(raw, block, some[n].of, suited, apart)
                     found.append(PairScores(some[n].number, block, power, masked))
         return found
 
@@ -466,24 +553,25 @@ class _MapSearch:
         reach = math.sqrt(self.config.scale_step)
         above = self.query.height_m - ground
         sigma = self.query.height_sigma_m
-        low = np.maximum(above - sigma, _LEAST_HEIGHT_M) / reach
-        high = np.maximum(above + sigma, _LEAST_HEIGHT_M) * reach
+        low = np.maximum(above - sigma, LEAST_HEIGHT_M) / reach
+        high = np.maximum(above + sigma, LEAST_HEIGHT_M) * reach
         height = self.heights[scale]
         mask = np.asarray((low <= height) & (height <= high))
         return SuitedOrigins(mask, float(np.isfinite(ground).mean()))
 
-    def masked(self, scores: Float32, block: Block, trial: Trial, apart: int) -> Float32:
-        suits = trial.blocks[block].mask
-        if not suits.all():
+    def masked(
+        self, scores: Float32, block: Block, of: Rectification, suited: SuitedOrigins, apart: int
+    ) -> Float32:
+        if not suited.mask.all():
             side = GROUND_CELLS // apart
-            fine = suits.astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
+            fine = suited.mask.astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
             fine = cv2.dilate(fine, np.ones((3, 3)))  # the last maxima are interpolated, too
             scores = np.where(fine, scores, np.float32(-1.0))
         if self.query.region is not None:
             at = np.arange(0, block.step, apart)
             rows, columns = at + block.row, at + block.column
             grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
-            inside = self.query.region.contains(self.camera_at(grid, trial.of))
+            inside = self.query.region.contains(self.camera_at(grid, of))
             scores = np.where(inside, scores, -1.0)
         return scores.astype(np.float32, copy=False)
 
@@ -494,6 +582,12 @@ class _MapSearch:
         east = level.west + middle[..., 1] - trial.centre[0]
         north = level.north - middle[..., 0] - trial.centre[1]
         return np.stack([east, north], axis=-1)
+
+    def origin_of(self, place: Array, of: Rectification) -> Array:
+        """Cell (2,) at which the patch of a camera at `place` (2,) begins."""
+        level = self.correlator.level
+        east, north = place + of.centre - np.array([level.west, level.north])
+        return np.array([-north, east]) / level.cell_m - of.cells / 2
 
     def merge(self, scores: Scores, pair: PairScores, noise: float) -> None:
         rows, columns = scores.best.shape

@@ -39,12 +39,24 @@ class SearchRegion:
 
 
 @dataclass(frozen=True)
+class EarlierFrame:
+    """A frame before the query's. rotation: as `PlaceQuery`, of its time; higher_m: of the camera,
+    than the query's.
+    """
+
+    frame: Frame
+    rotation: Array
+    higher_m: float
+
+
+@dataclass(frozen=True)
 class PlaceQuery:
     """One frame with the other sensors' data of its camera.
 
     rotation: (3, 3) world_from_camera by autopilot and gimbal. tilt_sigma_rad: sigma of its roll
     and pitch; heading_sigma_rad: of its heading, None if the heading is unknown. height_m: the
-    camera's world z (barometer, m). region: contains the camera, None for the whole map.
+    camera's world z (barometer, m). region: contains the camera, None for the whole map. earlier:
+    frames of the last seconds, newest first, for a strip.
     """
 
     frame: Frame
@@ -54,6 +66,7 @@ class PlaceQuery:
     height_m: float
     height_sigma_m: float
     region: SearchRegion | None = None
+    earlier: tuple[EarlierFrame, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -159,6 +159,42 @@ def test_a_place_of_seconds_ago_is_looked_for_again_where_it_can_be_by_now(slowl
     assert slow.queries[1].heading_sigma_rad < slow.queries[0].heading_sigma_rad
 
 
+def test_the_frames_of_the_last_seconds_are_searched_with_every_second_time(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    slow.blind, slow.wide_s = True, 0.0
+    for _ in range(75):  # five a second
+        falling.time_s += 0.2
+        search.keep(falling.frame())
+    falling.time_s += 0.1
+    for _ in range(3):
+        search.search(falling.frame(), lambda: False)
+    first, second, third = (q.earlier for q in slow.queries)
+    assert (len(second), len(third)) == (0, 10)
+    ago_s = [(slow.queries[0].frame.exposure_time_ns - e.frame.exposure_time_ns) * 1e-9
+             for e in first]  # fmt: skip
+    np.testing.assert_allclose(np.diff(ago_s), 1.0, atol=1e-6)
+    assert 0.0 < ago_s[0] <= 1.1
+    np.testing.assert_allclose([e.higher_m for e in first], 2.0 * np.array(ago_s))
+    falling.time_s += 60.0
+    search.search(falling.frame(), lambda: False)
+    search.search(falling.frame(), lambda: False)
+    assert slow.queries[-1].earlier == ()  # too old, all of them
+
+
+def test_a_kept_frame_is_small_and_its_camera_sees_as_far(slowly):
+    search, slow = slowly(Falling())
+    slow.blind, large = True, Camera.from_fov(1920, 1080, 70.0)
+    first, later = (
+        Frame(np.zeros((1080, 1920, 3), np.uint8), k * 1_000_000_000, large, k) for k in (1, 2)
+    )
+    search.keep(first)
+    search.search(later, lambda: False)
+    (kept,) = slow.queries[-1].earlier
+    assert kept.frame.image.shape == (270, 480, 3)
+    assert kept.frame.camera.horizontal_fov_deg == pytest.approx(70.0)
+
+
 def test_a_place_that_three_frames_do_not_show_again_is_forgotten(slowly):
     falling = Falling()
     search, slow = slowly(falling)

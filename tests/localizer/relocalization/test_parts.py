@@ -22,7 +22,7 @@ from localizer.relocalization.correlate import (
     transform_patch,
 )
 from localizer.relocalization.overview import FeatureFile, OverviewLevel, Projection
-from localizer.relocalization.patch import footprint, rectify, with_heading
+from localizer.relocalization.patch import CameraFootprint, footprint, rectify, with_heading
 from localizer.relocalization.search import (
     Rectification,
     SearchView,
@@ -34,6 +34,7 @@ from localizer.relocalization.search import (
     trial_heights,
     trial_noise,
 )
+from localizer.relocalization.strip import GroundStrip
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier
 from localizer.render.topview import DOWN
@@ -199,6 +200,59 @@ def test_a_place_between_the_compared_origins_is_found_where_it_is(r, c):
     at = found[0].world_from_camera.translation
     np.testing.assert_allclose(at[:2] / overview.cell_m, (c + n / 2, -r - n / 2), atol=0.1)
     assert found[0].score > 0.85
+
+
+class PictureFeatures:
+    """An extractor whose features are the picture's colours, averaged over its cells."""
+
+    name = "colours"
+
+    def extract(self, rgb):
+        h, w = rgb.shape[0] // 4, rgb.shape[1] // 4
+        cells = cv2.resize(rgb.astype(np.float32) - 128, (w, h), interpolation=cv2.INTER_AREA)
+        return FeaturePyramid((FeatureLevel(cells, np.ones((h, w), np.float32), 4),), 4 * w, 4 * h)
+
+
+def pictured(features, cell_m, centre, side_m, height_m):
+    """The strip that shows a square of ground (m), with its camera above `centre`."""
+    n = round(side_m / cell_m)
+    first = np.rint((np.array([-centre[1], centre[0]]) - side_m / 2) / cell_m).astype(int)
+    cut = features[:, first[0] : first[0] + n, first[1] : first[1] + n].transpose(1, 2, 0)
+    rgb = cv2.resize((cut.astype(np.int16) + 128).astype(np.uint8), (4 * n, 4 * n))
+    image = np.dstack([rgb, np.full((4 * n, 4 * n), 255, np.uint8)])
+    focal = height_m * 4 / cell_m
+    camera = Camera(4 * n, 4 * n, focal, focal, 2 * n, 2 * n)
+    return GroundStrip(image, camera, CameraFootprint(np.zeros(2), side_m / height_m))
+
+
+def test_equal_ground_is_told_apart_by_what_lies_beside_it():
+    """The frame shows the second place better; its strip shows what is about the first."""
+    cells = np.stack([cv2.GaussianBlur(x.astype(np.float32), (0, 0), 4) for x in smooth(8, 1024)])
+    cells = np.rint(cells * (30 / cells.std())).clip(-127, 127).astype(np.int8)
+    right, wrong, n, height = (512, 448), (800, 200), 32, 100.0
+    own = np.stack([cv2.GaussianBlur(x.astype(np.float32), (0, 0), 4) for x in smooth(9, n)])
+    own = np.rint(own * (30 / own.std())).clip(-127, 127)
+    other = smooth(7, n)
+    for (r, c), mixed in ((right, own + 0.5 * other), (wrong, own)):
+        cells[:, r : r + n, c : c + n] = mixed.clip(-127, 127).astype(np.int8)
+    fine = level(cells)
+    coarse = cells.reshape(3, 512, 2, 512, 2).mean(axis=(2, 4)).astype(np.int8)
+    levels = (fine, replace(level(coarse), gsd_m=1.0))
+    place = np.array([right[1] + n / 2, -(right[0] + n / 2)]) * fine.cell_m
+    strip = pictured(coarse, 4.0, place, 256.0, height)
+    frame = pictured(cells, 2.0, np.array([wrong[1] + 16, -(wrong[0] + 16)]) * 2.0, 64.0, height)
+    asked = query(height_m=height, height_sigma_m=0.0)
+    correlators = tuple(LevelCorrelator(x, 1 << 26) for x in levels)
+    best = []
+    for view in (
+        SearchView(frame.image, frame.camera),
+        SearchView(frame.image, frame.camera, lambda: strip),
+    ):
+        found = search(view, asked, correlators, PictureFeatures(), CONFIG)
+        assert found is not None
+        best.append(found[0].world_from_camera.translation[:2])
+    there = np.array([wrong[1] + n / 2, -(wrong[0] + n / 2)]) * fine.cell_m
+    np.testing.assert_allclose(best, [there, place], atol=2.0)
 
 
 def test_a_trials_noise_is_that_of_the_ground_it_was_compared_with(monkeypatch):

@@ -18,12 +18,20 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.jngo import JNGO
+from localizer.relocalization import search as searching
 from localizer.relocalization import verdict
+from localizer.relocalization.correlate import ORIGIN_CELLS, ROUGH_CELLS, LevelCorrelator
 from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.overview import open_overview, overview_key
-from localizer.relocalization.patch import with_heading
+from localizer.relocalization.patch import footprint, with_heading
 from localizer.relocalization.relocalizer import open_relocalizer
-from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
+from localizer.relocalization.strip import lay_together
+from localizer.relocalization.types import (
+    EarlierFrame,
+    PlaceCandidate,
+    PlaceQuery,
+    SearchRegion,
+)
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import DOWN
 from localizer.types import Frame
@@ -86,6 +94,42 @@ def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
     assert found.separation > 1.0
     off = found.world_from_camera.translation - truth.translation
     assert off @ np.linalg.solve(found.covariance[:3, :3], off) < 30
+
+
+def test_frames_of_the_seconds_before_lead_to_the_place(
+    opened, query, truth, small_assets, monkeypatch
+):
+    """Laid together they are compared with the coarser level, and its best places looked at."""
+    earlier = []
+    for k in range(1, 6):
+        way = k * np.array([-13.0, 7.0, 1.5])
+        pose = Pose(truth.rotation, truth.translation + way)
+        frame = Frame(seen_from(pose, small_assets), 123 - k, CAMERA, 7 - k)
+        earlier.append(EarlierFrame(frame, query.rotation, 1.5 * k))
+    monkeypatch.setattr(searching, "_MOST_PAIRS", 8)
+    made, compared = [], []
+    monkeypatch.setattr(
+        "localizer.relocalization.relocalizer.lay_together",
+        lambda *a: made.append(lay_together(*a)) or made[-1],
+    )
+    correlate = LevelCorrelator.correlate_all
+    monkeypatch.setattr(
+        LevelCorrelator, "correlate_all",
+        lambda self, *a: compared.append((self.level.gsd_m, a[2])) or correlate(self, *a),
+    )  # fmt: skip
+    candidates = opened.relocalizer.search(replace(query, earlier=tuple(earlier)))
+    (strip,) = made
+    side_m = strip.seen.side_m * 110.0
+    assert 1.2 * footprint(CAMERA, truth.rotation, 110.0, 340.0).side_m < side_m < 340.0
+    assert set(compared) == {(1.0, ROUGH_CELLS), (0.5, ORIGIN_CELLS)}
+    off = candidates[0].world_from_camera.translation[:2] - truth.translation[:2]
+    assert np.linalg.norm(off) < 10.0
+    assert opened.relocalizer.confirm(query, candidates) is not None
+    # On the ground, where the last seconds are as nothing.
+    stands = replace(query, height_m=query.height_m - 110.0, earlier=(replace(
+        earlier[0], frame=query.frame, higher_m=0.0),))  # fmt: skip
+    assert opened.relocalizer.search(stands)
+    assert len(made) == 2
 
 
 def test_a_twin_that_is_as_credible_forbids_an_answer(opened, query, truth, monkeypatch):
