@@ -46,7 +46,8 @@ class GroundStrip:
 
 def lay_together(views: Sequence[GroundView], largest_m: float, gsd_m: float) -> GroundStrip | None:
     """A strip of the views, newest first, up to the first one that does not show its neighbour's
-    ground, or for which it would be larger than `largest_m`; None if that leaves one, or a few pixels.
+    ground, or for which it would be larger than `largest_m`; None if that leaves one, or
+    a few pixels.
     """
     height = views[0].height_m
     grounds = [footprint(v.camera, v.rotation, v.height_m, largest_m) for v in views]
