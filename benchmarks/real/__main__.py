@@ -1,14 +1,15 @@
 """The product's judgement on real imagery: what it accepts, and how wrong it says that it may be.
 
     python -m benchmarks.real FOLDER [--sets fengyuan neon ...] [--attitudes 0.3 1 3 none]
-    python -m benchmarks.real FOLDER --search --json real.json --plot real.png
+    python -m benchmarks.real FOLDER --search --json search.json
 
 FOLDER keeps the maps between runs. Each image begins from a prior up to 10 m off; roll, pitch and
 the height (3 m) are reported with the stated sigma, or not at all. A registration is right where
 the middle of its image lies on its true ground. NEES: squared error over the claimed covariance and
 the truth's own, per degree of freedom, the median of the accepted. --search: each image without a
-prior, heading unknown, on its map and on one that does not hold it. --displaced N: only wrong
-priors, N of each image, 45 to 110 m off while they claim 6 m; roll and pitch known to 1 degree.
+prior, heading unknown, on its map and on one that does not hold it; their table goes to --json.
+--displaced N: only wrong priors, N of each image, 45 to 110 m off while they claim 6 m; roll and
+pitch known to 1 degree.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.arguments import Parser, output, whole
-from benchmarks.common.figures import markdown, show_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.real.judged import ATTITUDES, JudgedImage, judged_images
 from benchmarks.real.report import (
@@ -85,15 +86,17 @@ def main() -> None:
             rows.append(judged_row(images))
             print(" | ".join(judged_cells(rows[-1])), flush=True)
     result["judged"] = rows
+    columns: Sequence[str] = JUDGED
+    cells = list(map(judged_cells, rows))
     if args.search:
         result["searched"] = [
             searched_row(list(searched_images(name, views[name], _map_of(name, args), args.width)))
             for name in args.sets
             if name in _SEARCHED
         ]
-        print(markdown(SEARCHED, list(map(searched_cells, result["searched"]))))
+        columns, cells = SEARCHED, list(map(searched_cells, result["searched"]))
     result["images"] = [asdict(i) for i in judged]
-    show_figures(args.json, JUDGED, list(map(judged_cells, rows)), result)
+    show_figures(args.json, columns, cells, result)
     if args.plot:
         plot(judged, args.plot)
 

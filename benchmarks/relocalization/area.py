@@ -131,6 +131,15 @@ def hide(place: Path, hay: Path, side_m: float, folder: Path) -> None:
     new.rename(folder)
 
 
+def hide_apart(place: Path, hay: Path, side_m: float, folder: Path) -> None:
+    """As `hide`, unless the folder exists; in another process, for the region as arrays is no part
+    of the memory that a search takes.
+    """
+    if not folder.exists():
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
+            other.submit(hide, place, hay, side_m, folder).result()
+
+
 def views_of(place: str, cache: Path, data: Path) -> list[RealView]:
     """The views of a place, of its first map; of another world than the region's."""
     if place == "generated":
@@ -199,10 +208,7 @@ def main() -> None:
         views = views_of(args.place, args.cache, args.data)
         hay = load_views("generated", args.cache, args.data, 1)[0].map_cache
         folder = args.cache / "area" / f"{args.place}-{args.km2:g}"
-        if not folder.exists():
-            # Elsewhere, for the region as arrays is no part of the memory that a search takes.
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
-                other.submit(hide, views[0].map_cache, hay, side_m, folder).result()
+        hide_apart(views[0].map_cache, hay, side_m, folder)
         kind = (args.place, known, round(args.km2))
         done = sum((a.place, a.heading_known, round(a.area_km2)) == kind for a in found)
         open_map = opened(folder)

@@ -72,14 +72,14 @@ SETS = {
     "elsewhere": ("generated/2000000/survey.cache", "generated/2000001/day.cache", 230.0),
 }
 SEARCHED = 5  # successive frames
-_FRAME_S, _SEARCH_FRAMES = 0.25, 2  # half a second from one searched frame to the next
+FRAME_S, _SEARCH_FRAMES = 0.25, 2  # half a second from one searched frame to the next
 _FRAMES = 40
 _AFTER = 3  # frames given out after the confirmation
 _FALSE_M = 5.0
 _REGION_M, _REGION_OFF_M = 100.0, 70.0
 _TILT_DEG, _HEADING_DEG = 0.7, 5.0  # sigmas of autopilot and gimbal
 _SPEED_SIGMA, _LEAST_SIGMA_M = 0.5, 0.5  # of the inertial way: m/s, m
-_PLACE_SIGMA = np.repeat([2.0, np.radians(1.0)], 3)  # of a found place, as in flight
+PLACE_SIGMA = np.repeat([2.0, np.radians(1.0)], 3)  # of a found place, as in flight
 _BYTES = 128 * 2**20
 
 
@@ -127,6 +127,8 @@ class TrialSite:
 class LostTrial:
     """One flight without a place, until it is found and confirmed, or not."""
 
+    frames, heights_m = _FRAMES, (55.0, 150.0)
+
     def __init__(self, site: TrialSite, index: int, heading_known: bool) -> None:
         self._site, self._index = site, index
         rng = np.random.default_rng((71, index))
@@ -134,10 +136,10 @@ class LostTrial:
         self._camera = Camera.from_fov(*SIZE, float(rng.uniform(50, 80)))
         self.condition = CONDITIONS[index % len(CONDITIONS)]
         self._known = SimulatedPlaceData(prior=False, heading=heading_known, seed=index)
-        self.height_m = float(np.exp(rng.uniform(np.log(55), np.log(150))))
+        self.height_m = float(np.exp(rng.uniform(*np.log(self.heights_m))))
         half = (site.half_m, site.half_m)
         speed = float(rng.uniform(5, 12))
-        plan = StretchPlan(_FRAMES * _FRAME_S, 1 / _FRAME_S, speed, self.height_m, half)
+        plan = StretchPlan(self.frames * FRAME_S, 1 / FRAME_S, speed, self.height_m, half)
         ground = ground_height(site.seen, np.array([*rng.uniform(-1, 1, 2) * 0.5 * half[0], 0.0]))
         self._way: TestStretch = make_stretch(plan, self.condition, 5_000 + index, ground)
         self._look: Appearance = sample_appearance(rng, self.condition)
@@ -172,7 +174,7 @@ class LostTrial:
                     right = metres <= RIGHT_M and degrees <= RIGHT_DEG and not site.elsewhere
                     wrong += not right
                     found_at = found_at or searches * right
-                    covariance = found.covariance + np.diag(_PLACE_SIGMA**2)
+                    covariance = found.covariance + np.diag(PLACE_SIGMA**2)
                     velocity = self._way.velocity + self._drift
                     localizer.offer(
                         PosePrior(found.world_from_camera, covariance, frame.exposure_time_ns,
@@ -191,7 +193,7 @@ class LostTrial:
                 far, _ = estimate.world_from_camera.distance_to(self._way.poses[k])
                 errors.append(float("inf") if site.elsewhere else far)
             if localizer.tracker.track_status.state is TrackingState.TRACKING:
-                confirmed_s = k * _FRAME_S if confirmed_s is None else confirmed_s
+                confirmed_s = k * FRAME_S if confirmed_s is None else confirmed_s
                 left -= 1
             k += 1
         return TrialOutcome(
@@ -209,13 +211,13 @@ class LostTrial:
 
     def _rotation(self, time_ns: int) -> Array:
         """By autopilot and gimbal, at the nearest frame."""
-        k = int(np.clip(round(time_ns * 1e-9 / _FRAME_S) - 1, 0, len(self._way.poses) - 1))
+        k = int(np.clip(round(time_ns * 1e-9 / FRAME_S) - 1, 0, len(self._way.poses) - 1))
         return so3_exp(self._off) @ self._way.poses[k].rotation
 
     def _displacement(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
         if not self.inertial:
             return None
-        first, last = (round(t * 1e-9 / _FRAME_S) - 1 for t in (begin_ns, end_ns))
+        first, last = (round(t * 1e-9 / FRAME_S) - 1 for t in (begin_ns, end_ns))
         seconds = (end_ns - begin_ns) * 1e-9
         way = self._way.poses[last].translation - self._way.poses[first].translation
         return way + self._drift * seconds, _LEAST_SIGMA_M + _SPEED_SIGMA * seconds
@@ -226,7 +228,12 @@ class LostTrial:
         view = self._site.seen.render(pose, self._camera, wait=True)
         look = limit_haze(self._look, view.depth)
         image = apply_appearance(soften(self._rng, view.rgb), view.depth, look, self._rng)
-        return Frame(image, round((k + 1) * _FRAME_S * 1e9), self._camera, k)
+        return Frame(image, self.time_ns(k), self._camera, k)
+
+    @staticmethod
+    def time_ns(k: int) -> int:
+        """Of the exposure."""
+        return round((k + 1) * FRAME_S * 1e9)
 
 
 def open_site(name: str, folder: Path, config: LocalizerConfig, stack: ExitStack) -> TrialSite:
