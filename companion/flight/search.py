@@ -240,7 +240,7 @@ class PlaceSearch:
         """Keep one frame a second, small, for the next searches. Called for each frame, on the
         thread of the video.
         """
-        if self._kept and _seconds(self._kept[0][0], frame) < _KEPT_EVERY_S:
+        if self._kept and 0.0 <= _seconds(self._kept[0][0], frame) < _KEPT_EVERY_S:
             return
         rotation = self._autopilot.rotation(frame.exposure_time_ns)
         height_m = self._autopilot.height_m

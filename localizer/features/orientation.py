@@ -38,6 +38,8 @@ def orientation_level(gray: Float32, stride: int, learned: Float32 | None = None
     distance, and n features of any length, which follow the orientation's channels.
     """
     h, w = gray.shape[0] // stride, gray.shape[1] // stride
+    if learned is not None and learned.shape[:2] != (h, w):
+        raise ValueError(f"learned features {learned.shape} for a level of {h}x{w}")
     bins = np.empty((ORIENTATIONS, h, w), np.float32)
     _histogram(gray, stride, _reduction(stride), _BLUR, _DIRECTIONS, bins)
     if learned is None:

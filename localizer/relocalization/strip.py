@@ -18,6 +18,7 @@ from localizer.types import Float32, Image
 
 _SIDE_PX = 256  # of two pictures whose shift is measured
 _SOFT_PX = 5.0  # their edges, which do not move with the ground (sigma)
+_LEAST_PX = 8  # of a strip's side, as of any camera
 _LEAST_RESPONSE = 0.1  # of a shift that is one: the share of its peak
 
 
@@ -45,7 +46,8 @@ class GroundStrip:
 
 def lay_together(views: Sequence[GroundView], largest_m: float, gsd_m: float) -> GroundStrip | None:
     """A strip of the views, newest first, up to the first one that does not show its neighbour's
-    ground, or for which it would be larger than `largest_m`; None if that leaves one.
+    ground, or for which it would be larger than `largest_m`; None if that leaves one, or
+    a few pixels.
     """
     height = views[0].height_m
     grounds = [footprint(v.camera, v.rotation, v.height_m, largest_m) for v in views]
@@ -64,9 +66,9 @@ def lay_together(views: Sequence[GroundView], largest_m: float, gsd_m: float) ->
             break
         places.append(places[-1] + way)
         centre, side = middle, whole
-    if len(places) == 1:
-        return None
     n = round(side / gsd_m)
+    if len(places) == 1 or n < _LEAST_PX:
+        return None
     image = np.zeros((n, n, 4), np.uint8)
     for view, place in zip(views, places, strict=False):
         at = rectify(
@@ -98,4 +100,5 @@ def _picture(view: GroundView, centre: Array, gsd_m: float) -> Float32:
     grey = cv2.cvtColor(at.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inner = cv2.GaussianBlur(at.seen.astype(np.float32), (0, 0), _SOFT_PX)
     weight = np.maximum(2 * inner - 1, 0)
-    return np.asarray((grey - grey[at.seen].mean()) * weight, np.float32)
+    mean = cv2.mean(grey, at.seen.astype(np.uint8))[0]  # 0 where nothing is seen
+    return np.asarray((grey - mean) * weight, np.float32)

@@ -195,6 +195,18 @@ def test_a_kept_frame_is_small_and_its_camera_sees_as_far(slowly):
     assert kept.frame.camera.horizontal_fov_deg == pytest.approx(70.0)
 
 
+def test_frames_are_kept_again_after_the_cameras_clock_jumped_back(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    slow.blind = True
+    for time_s in (60.0, 61.0, 10.0, 11.0):
+        falling.time_s = time_s
+        search.keep(falling.frame())
+    falling.time_s = 12.0
+    search.search(falling.frame(), lambda: False)
+    assert [e.frame.exposure_time_ns for e in slow.queries[-1].earlier] == [11 * S, 10 * S]
+
+
 def test_a_place_that_three_frames_do_not_show_again_is_forgotten(slowly):
     falling = Falling()
     search, slow = slowly(falling)

@@ -124,6 +124,15 @@ def test_a_description_that_lies_about_levels_is_found(tmp_path: Path) -> None:
         load_extractor(model)
 
 
+def test_a_description_that_lies_about_a_stride_is_found(tmp_path: Path) -> None:
+    model = copied_model(tmp_path)
+    description = json.loads(model.with_suffix(".json").read_text())
+    description["levels"][0]["stride"] *= 2
+    model.with_suffix(".json").write_text(json.dumps(description | {"multiple": 16}))
+    with pytest.raises(ModelError, match="for a level of 4x4"):
+        load_extractor(model)
+
+
 def test_a_description_that_leaves_a_level_out_is_found(tmp_path: Path) -> None:
     model = copied_model(tmp_path)
     path = model.with_suffix(".json")

@@ -1,5 +1,7 @@
 """Views of one ground laid together: where each shows it, and what is none of it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -82,3 +84,11 @@ def test_a_strip_ends_where_views_have_nothing_in_common_and_at_its_largest_side
     assert limited is not None
     assert limited.seen.side_m * HEIGHT <= largest
     np.testing.assert_array_equal(limited.image, three.image)
+
+
+def test_there_is_no_strip_of_a_few_pixels_or_of_views_from_the_ground_or_of_the_sky():
+    picture = ground(1)
+    views = flown(picture, 3)
+    assert lay_together([replace(v, height_m=1.0) for v in views], 400.0, 0.5) is None
+    for unfit in (replace(views[1], height_m=-8.0), replace(views[1], rotation=np.eye(3))):
+        assert lay_together([views[0], unfit], 400.0, 0.5) is None
