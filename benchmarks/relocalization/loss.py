@@ -197,7 +197,8 @@ def cells(outcomes: list[LossOutcome]) -> list[tuple[str, ...]]:
 def main() -> None:
     p = Parser(__doc__)
     p.add_argument("folder", type=existing, nargs="?", help="of worlds and maps")
-    p.add_argument("--place", choices=("generated", "unseen", "quito"), default="generated")
+    places = ("generated", "unseen", "quito")
+    p.add_argument("--place", choices=places, default="generated", help="hidden")
     p.add_argument("--km2", type=number(1, 400), default=100.0, help="area")
     p.add_argument("--first", type=whole(0, 100_000), default=0, help="number of the first flight")
     p.add_argument("--flights", type=whole(1, 1000), default=8, help="how many")
