@@ -45,7 +45,7 @@ from localizer.tracking.pipeline import Localizer
 from localizer.types import PosePrior, TrackingState
 
 _LOST_AT, _KEPT = 39, 10  # frame; frames of a strip
-_LATEST_S = 60.0
+_LATEST = 280  # frame in which a search may begin: a minute after the loss
 _FALSE_M = 5.0
 _MISSES = 3  # searches near a place
 COLUMNS = (
@@ -88,9 +88,9 @@ class LostOverRegion(LostTrial):
         first_cpu_s, found_s = 0.0, None
         errors: list[float] = []
         seen: RelocalizationHypothesis | None = None
-        while (k - _LOST_AT) * FRAME_S < _LATEST_S:
-            began, cpu = time.perf_counter(), time.process_time()
+        while k < _LATEST:
             query = self.query(k, together=seen is None and len(ranks) % 2 == 0)
+            began, cpu = time.perf_counter(), time.process_time()  # an aircraft renders nothing
             if seen is not None:
                 near = seen.predicted_query(query, None, None)
                 found = site.relocalizer.find(near) if near is not None else None
