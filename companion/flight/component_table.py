@@ -22,10 +22,9 @@ from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics, target_report
 from companion.errors import ConfigError
 from companion.flight.calibration_observer import CalibrationObserver
-from companion.flight.channels import Feed
+from companion.flight.channels import Feed, FixInjection, is_for_injection
 from companion.flight.components import Assembly, Component
 from companion.flight.health import HealthInputs, HealthMonitor
-from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
 from companion.flight.priors import AutopilotPose, local_near
 from companion.flight.reachable_region import ReachableRegion
@@ -56,7 +55,7 @@ from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from localizer.map.inspection.kind import map_kind
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.motion import AuxiliarySensors

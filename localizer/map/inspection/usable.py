@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localizer.geometry.antimeridian import GeoBox, lon_near, wrapped
 from localizer.geometry.geo import LocalFrame
-from localizer.map.inspection.mosaic import Mosaic
+from localizer.map.inspection.alignment import Mosaic
 
 _CELL_OF_HEIGHT = 1 / 8  # a hole of a tenth of such a cell takes nothing from a view
 _MOST_CELLS = 400  # a side

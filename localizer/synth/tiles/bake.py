@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
-from localizer.synth.buildings.model import LEAF, MID, NEAR_LEVELS, ROOT, TOP
+from localizer.synth.buildings.shell import LEAF, MID, NEAR_LEVELS, ROOT, TOP
 from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
 from localizer.synth.paint.covers import WindowLight, new_image
 from localizer.synth.paint.ground import light_ground, paint_albedo

@@ -10,14 +10,19 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
-from localizer.synth.buildings.model import NEAR_LEVELS, Building, Surface
+from localizer.synth.buildings.shell import NEAR_LEVELS, Building, Surface
 from localizer.synth.config import LEAF_GSD_M, LEAF_M
 from localizer.synth.paint.covers import Cover, WindowLight, new_image
 from localizer.synth.paint.facades import paint_surface
 from localizer.synth.tiles.charts import ChartedMesh
-from localizer.synth.tiles.props import CAR_COLOURS, car_image, car_shape
 from localizer.synth.tiles.scene import TileScene, car_positions, hedge_quads
-from localizer.synth.tiles.vegetation import crown_images, tree_meshes
+from localizer.synth.tiles.vegetation import (
+    CAR_COLOURS,
+    car_image,
+    car_shape,
+    crown_images,
+    tree_meshes,
+)
 
 _MAX_CHART_PX = 800
 _CAR_PX_PER_M = 16

@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
-from localizer.synth.buildings.model import LEAF, MID, Building
+from localizer.synth.buildings.shell import LEAF, MID, Building
 from localizer.synth.config import TERRAIN_SPACING_M
 from localizer.synth.paint.lighting import DSM_GSD_M, raise_surface
-from localizer.synth.plan.plan import Hedge, WorldPlan
+from localizer.synth.plan.planner import Hedge, WorldPlan
 from localizer.synth.plan.terrain import Terrain
-from localizer.synth.tiles.props import PropShape, car_shape
-from localizer.synth.tiles.vegetation import hedge_corners, tree_meshes
-from localizer.synth.visits.changes import apply_changes
-from localizer.synth.visits.visit import Visit
+from localizer.synth.tiles.vegetation import PropShape, car_shape, hedge_corners, tree_meshes
+from localizer.synth.visits.visit import Visit, apply_changes
 
 _DSM_MARGIN_M = 20.0
 

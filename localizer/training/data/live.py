@@ -13,21 +13,53 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from localizer.training.config import LiveSection, TrainConfig
+from localizer.training.config import DataSection, LiveSection, TrainConfig
 from localizer.training.data.batches import (
     BatchStream,
+    Schedule,
+    ShardStream,
     TrainingSample,
     collate,
     crop_pair,
 )
 from localizer.training.data.pairs import (
+    FIRST_WORLD_SEED,
     PlaceVisits,
     draw_views,
     low_priority,
     make_place,
     render_pair,
 )
+from localizer.training.data.shards import shard_path, world_shard_paths
 from localizer.training.losses import Batch
+
+
+def open_stream(
+    config: TrainConfig, rank: int, count: int, generating: Future[None] | None
+) -> BatchStream:
+    """The batches of the process `rank` of a run's `count`. generating: writes missing shards
+    meanwhile.
+    """
+    data = config.data
+    if isinstance(data, DataSection):
+        shards = schedule(data)
+        return ShardStream(shards, config.optimizer, config.seed, rank, generating)
+    return LiveStream(config, rank, count)
+
+
+def schedule(data: DataSection) -> Schedule:
+    """Which shards each step of a run draws from."""
+    seeds = range(data.first_seed, data.first_seed + data.scenes)
+    worlds = range(FIRST_WORLD_SEED, FIRST_WORLD_SEED + data.worlds)
+    return Schedule(
+        tuple(shard_path(data.shards, seed) for seed in seeds),
+        data.initial_scenes,
+        data.scenes_per_step,
+        tuple(path for seed in worlds for path in world_shard_paths(data.shards, seed)),
+        data.world_share,
+        data.world_first_step,
+    )
+
 
 _SPARE = 1.25  # candidates for each sample: some see too little in common
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import degrees, isnan
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -9,13 +10,139 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.ekf.injection import Clock
-from sitl.embedded.mavlink.gimbal_commands import GimbalCommands
-from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
+from sitl.embedded.mavlink.handling import (
+    ACCEPTED,
+    FAILED,
+    UNSUPPORTED,
+    CommandHandler,
+    Handler,
+    location_of,
+)
 from sitl.embedded.mavlink.navigation_commands import NavigationCommands
-from sitl.embedded.mavlink.parameter_commands import ParameterCommands
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import TelemetryBuilder
+from sitl.embedded.physics.gimbal import FLAG_NEUTRAL, FLAG_YAW_LOCK
 from sitl.embedded.severity import INFO, WARNING
+
+
+class GimbalCommands:
+    """Handlers by message name and by command number."""
+
+    def __init__(self, vehicle: Aircraft) -> None:
+        self._vehicle = vehicle
+        self.messages: dict[str, Handler] = {
+            "GIMBAL_MANAGER_SET_PITCHYAW": self._gimbal_pitchyaw_message,
+        }
+        m = mavlink
+        self.commands: dict[int, CommandHandler] = {
+            m.MAV_CMD_DO_MOUNT_CONTROL: self._mount_control,
+            m.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW: self._gimbal_pitchyaw,
+            m.MAV_CMD_DO_SET_ROI_LOCATION: self._roi,
+            m.MAV_CMD_DO_SET_ROI: self._roi,
+            m.MAV_CMD_DO_SET_ROI_NONE: self._roi_none,
+        }
+
+    def _mount_control(self, _link: SerialPort, command: Any) -> int:
+        gimbal = self._vehicle.gimbal
+        mode = int(command.z if command.get_type() == "COMMAND_INT" else command.param7)
+        if not gimbal.fitted:
+            return FAILED
+        if mode == 2:  # MAV_MOUNT_MODE_MAVLINK_TARGETING
+            gimbal.point(command.param1, command.param3, yaw_locked=False)
+        elif mode in (0, 1):
+            gimbal.neutral()
+        else:
+            return FAILED
+        return ACCEPTED
+
+    def _gimbal_pitchyaw(self, _link: SerialPort, command: Any) -> int:
+        flags = int(command.x if command.get_type() == "COMMAND_INT" else command.param5)
+        return self._point(command.param1, command.param2, command.param3, command.param4, flags)
+
+    def _gimbal_pitchyaw_message(self, _link: SerialPort, message: Any) -> None:
+        self._point(
+            degrees(message.pitch),
+            degrees(message.yaw),
+            degrees(message.pitch_rate),
+            degrees(message.yaw_rate),
+            message.flags,
+        )
+
+    def _point(
+        self, pitch: float, yaw: float, pitch_rate: float, yaw_rate: float, flags: int
+    ) -> int:
+        gimbal = self._vehicle.gimbal
+        if not gimbal.fitted:
+            return FAILED
+        locked = bool(flags & FLAG_YAW_LOCK)
+        if flags & FLAG_NEUTRAL:
+            gimbal.neutral()
+        elif not (isnan(pitch) or isnan(yaw)):
+            gimbal.point(pitch, yaw, yaw_locked=locked)
+        elif not (isnan(pitch_rate) or isnan(yaw_rate)):
+            gimbal.rotate(pitch_rate, yaw_rate, yaw_locked=locked)
+        else:
+            return FAILED
+        return ACCEPTED
+
+    def _roi(self, _link: SerialPort, command: Any) -> int:
+        v = self._vehicle
+        if not v.gimbal.fitted or command.get_type() != "COMMAND_INT":
+            return FAILED
+        location = location_of(
+            self._vehicle.modes.home, command.frame, command.x, command.y, command.z
+        )
+        if location is None:
+            return FAILED
+        v.gimbal.look_at(location)
+        return ACCEPTED
+
+    def _roi_none(self, _link: SerialPort, _command: Any) -> int:
+        self._vehicle.gimbal.look_at(None)
+        return ACCEPTED
+
+
+class ParameterCommands:
+    """Handlers by message name."""
+
+    def __init__(self, vehicle: Aircraft) -> None:
+        self._vehicle = vehicle
+        self.messages: dict[str, Handler] = {
+            "PARAM_REQUEST_LIST": self._param_list,
+            "PARAM_REQUEST_READ": self._param_read,
+            "PARAM_SET": self._param_set,
+        }
+
+    def _param_value(self, name: str, index: int) -> Any:
+        p = self._vehicle.parameters
+        return mavlink.MAVLink_param_value_message(
+            name.encode(), p.encode_value(name), p.type_of(name), len(p), index
+        )
+
+    def _param_list(self, link: SerialPort, _message: Any) -> None:
+        for index, name in enumerate(self._vehicle.parameters):
+            link.send(self._param_value(name, index))
+
+    def _param_read(self, link: SerialPort, message: Any) -> None:
+        p = self._vehicle.parameters
+        name = _text(message.param_id)
+        found = name if message.param_index < 0 else p.name_at(message.param_index)
+        if found is not None and found in p:
+            link.send(self._param_value(found, p.index_of(found)))
+
+    def _param_set(self, _link: SerialPort, message: Any) -> None:
+        v = self._vehicle
+        name = _text(message.param_id)
+        p = v.parameters
+        if name in p and p.set(name, p.decode_value(name, message.param_value)):
+            # ArduPilot tells every link of a change, with an index of 65535.
+            v.server.broadcast(self._param_value(name, 65535))
+
+
+def _text(value: str | bytes) -> str:
+    text = value.decode("ascii", "replace") if isinstance(value, bytes) else value
+    return text.rstrip("\0")
+
 
 _FORCE_ARM = 21196.0
 

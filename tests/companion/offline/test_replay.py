@@ -26,7 +26,7 @@ from companion.sources.zoom import ZoomTable
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.engine import DualThreadEngine
 from mavlink_bridge.link.tlog import read_tlog

@@ -21,14 +21,19 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest, VisionFix
+from mavlink_bridge.alerts.catalogue import values_of
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.reading import values_of
 from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
+from sitl.vehicles.launch import (
+    GIMBAL,
+    ArduPilotSitl,
+    EmbeddedSitl,
+    find_arducopter,
+    vision_only_parameters,
+)
 
 PROMISED = (
     "CAMERA_TRACKING_GEO_STATUS",
