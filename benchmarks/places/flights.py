@@ -26,9 +26,8 @@ from sitl.camera.movers import traffic
 from sitl.camera.realism import CameraClock
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
-from sitl.demo.budget import draw_errors
 from sitl.demo.kinematic import camera_path, record_sequence
-from sitl.demo.scenario import Scenario, ScenarioLeg
+from sitl.demo.scenario import Scenario, ScenarioLeg, draw_errors
 
 CONDITIONS = ("day", "dusk", "night", "fog", "rain/snow", "season")
 HEIGHTS = ("low", "high")

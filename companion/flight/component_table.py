@@ -30,8 +30,7 @@ from companion.flight.priors import AutopilotPose, local_near
 from companion.flight.reachable_region import ReachableRegion
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, enu_on_map
-from companion.flight.view_reporter import ViewReporter
-from companion.ground.vital_signs import VitalSigns
+from companion.ground.vital_signs import ViewReporter, VitalSigns
 from companion.inertial import InertialTrack
 from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.debouncer import InhibitMemory

@@ -1,7 +1,7 @@
 """Forecast at one pose: simulated frames of another day are registered as in flight.
 
 The view of another day: geometry stays. Light, weather and sensor are
-`localizer.synth.appearance`'s, changes of the fine texture `localizer.synth.visits.texture`'s.
+`localizer.synth.appearance`'s, changes of the fine texture `localizer.synth.visits.visit`'s.
 Moved shadows and map errors are not simulated; `SIGMA` is fitted on worlds that have both.
 
 It and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its tuning worlds:
@@ -35,7 +35,7 @@ from localizer.registration.result import Registration
 from localizer.registration.selection import quality, subsample_anchors
 from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import CONDITIONS, weathered
-from localizer.synth.visits.texture import hard_surfaces, with_new_texture
+from localizer.synth.visits.visit import hard_surfaces, with_new_texture
 from localizer.tracking.pipeline import reference_anchors, working_camera
 from localizer.types import Anchors, Float32, Image, PosePrior, RegistrationStatus, RenderedView
 

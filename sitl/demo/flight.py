@@ -29,7 +29,6 @@ from sitl.camera.movers import Mover, traffic
 from sitl.camera.pose_sender import GimbalError, map_enu, truth_feed
 from sitl.camera.process import CameraStatistics, WorldCameraConfig, WorldCameraProcess
 from sitl.demo.assets import FlightAssets
-from sitl.demo.budget import FlightErrors, draw_errors
 from sitl.demo.companion_process import (
     THIS_PROGRAM,
     FlightCompanion,
@@ -38,7 +37,7 @@ from sitl.demo.companion_process import (
     write_deployment,
 )
 from sitl.demo.kinematic import camera_path
-from sitl.demo.scenario import Scenario, VehicleChoice
+from sitl.demo.scenario import FlightErrors, Scenario, VehicleChoice, draw_errors
 from sitl.demo.script import FlightScript, Progress
 from sitl.errors import FlightError, SimulationError
 from sitl.geodesy import Location

@@ -21,8 +21,7 @@ from sitl.camera.movers import traffic
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.assets import FlightAssets
-from sitl.demo.budget import draw_errors
-from sitl.demo.scenario import Scenario
+from sitl.demo.scenario import Scenario, draw_errors
 
 _JPEG_QUALITY = 92
 

@@ -16,7 +16,7 @@ from companion.offline.record import read_columns
 from companion.targets.detections import clicked_name
 from companion.writing import write_result
 from localizer.geometry.pose import Array
-from sitl.demo.budget import draw_errors
+from sitl.demo.scenario import draw_errors
 from sitl.errors import SimulationError
 from sitl.operator.pursuer import LATE_S, LATE_SIGMA_S, SECONDS, Chase, Pursuer
 from sitl.suite.loop.case import LoopCase

@@ -17,11 +17,12 @@ from localizer.map.cache.tile import orientation_fault, vector_area
 from localizer.map.inspection.alignment import (
     ImageryOffset,
     Mosaic,
+    UsableArea,
     measure_alignment,
     render_mosaic,
+    usable_part,
 )
 from localizer.map.inspection.kind import map_kind
-from localizer.map.inspection.usable import UsableArea, usable_part
 from localizer.map.kind import HEIGHTS_HOLD, MapKind
 from localizer.types import Image
 

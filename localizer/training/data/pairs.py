@@ -27,7 +27,7 @@ from localizer.synth.heightfield.scene import (
     light_scene,
     omit_randomly,
 )
-from localizer.synth.visits.texture import draw_texel, with_new_texture, with_wet_patches
+from localizer.synth.visits.visit import draw_texel, with_new_texture, with_wet_patches
 from localizer.training.places.land import PhotoLibrary, generated_place, photo_place
 from localizer.training.places.objects import (
     TrainingPlace,

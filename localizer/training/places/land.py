@@ -13,7 +13,7 @@ from localizer.errors import SequenceError
 from localizer.pictures import read_rgb
 from localizer.plain_files import without_hidden
 from localizer.synth.heightfield.scene import Land, Prism
-from localizer.synth.visits.texture import hard_surfaces, noise
+from localizer.synth.visits.visit import hard_surfaces, noise
 from localizer.training.places.objects import (
     TrainingPlace,
     building,

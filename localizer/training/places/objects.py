@@ -1,7 +1,7 @@
 """Objects of training places, drawn at random, and the surface that photogrammetry leaves.
 
 The surface is rounded, bumpy, without windows. What the ground's texture becomes between two visits
-is `localizer.synth.visits.texture`.
+is `localizer.synth.visits.visit`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.synth.heightfield.scene import Land, LitScene, Prism, block_maxima
-from localizer.synth.visits.texture import noise
+from localizer.synth.visits.visit import noise
 from localizer.types import Float32
 
 

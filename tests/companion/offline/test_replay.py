@@ -18,9 +18,8 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import load_record, read_record
-from companion.offline.replay import replay, summarize
+from companion.offline.replay import RecordedAutopilot, replay, summarize
 from companion.reporting.pictures import map_pictures
 from companion.sources.zoom import ZoomTable
 from localizer.geometry.camera import Camera

@@ -17,8 +17,8 @@ from companion.config import CompanionConfig, load_config
 from companion.errors import ReportError
 from companion.preflight import self_test
 from companion.preflight.map_pin import map_hash
+from companion.preflight.self_test import STAGES, StageTime, stage_times
 from companion.preflight.sheet import as_html, as_text, make_sheet, write_sheet
-from companion.preflight.stages import STAGES, StageTime, stage_times
 from localizer.config import LocalizerConfig
 from localizer.features.extractor import load_extractor
 from localizer.map.cache.cache import MANIFEST_NAME
