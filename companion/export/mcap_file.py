@@ -4,6 +4,8 @@ Topics: /vision/pose, /vision/location, /tf, /camera/image, /camera/calibration,
 /targets/map, /autopilot/location, /gnss/location, /events, /mavlink/text, /diagnostics.
 """
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Any

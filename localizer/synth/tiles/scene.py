@@ -1,5 +1,7 @@
 """One visit to a planned world: what stands there, painted, and the surface that casts shadows."""
 
+from __future__ import annotations
+
 from collections import defaultdict
 from dataclasses import dataclass
 

@@ -4,6 +4,8 @@ They look like what the localizer flies over: tiles at several levels of detail,
 facades. Seeds below `FIRST_WORLD_SEED` belong to demos and tests and are never used here.
 """
 
+from __future__ import annotations
+
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack

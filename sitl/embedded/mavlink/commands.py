@@ -1,5 +1,7 @@
 """Handles MAVLink messages addressed to the vehicle."""
 
+from __future__ import annotations
+
 from math import degrees, isnan, radians
 from typing import Any
 
