@@ -113,7 +113,7 @@ def test_places_of_the_mission(with_mission: Callable[..., Any], monkeypatch) ->
 )
 def test_refusal_and_silence_are_named(with_mission, monkeypatch, how, why):
     monkeypatch.setattr(
-        "mavlink_bridge.preflight.client._ANSWER_S", 0.1 if "silent" in how else 30.0
+        "mavlink_bridge.preflight.client._ITEM_ANSWER_S", 0.1 if "silent" in how else 30.0
     )
     vehicle = with_mission(**how)
     with pytest.raises(MissionError, match=rf"number of items .*{why}"):
