@@ -1,9 +1,13 @@
+<<<<<<< HEAD
 """The catalogue: one row for each alert. All texts and tables are made from it, and read by it."""
 
 from __future__ import annotations
 
 import re
 from functools import cache
+=======
+"""The catalogue: one row for each alert. All texts and tables are made from it."""
+>>>>>>> a4aca9fa (alerts: keep the reader of texts apart, as its test asks)
 
 from mavlink_bridge.alerts.alert import PREFIX, Alert, AlertSpec, Severity, Value
 from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
@@ -11,45 +15,6 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.injection import INJECTION
 from mavlink_bridge.alerts.integrity import INTEGRITY, MONITOR, SOURCES
 from mavlink_bridge.alerts.vehicle import VEHICLE
-
-_FIELD = re.compile(r"\{(\w+)[^}]*\}")
-
-
-@cache
-def _patterns() -> tuple[tuple[AlertId, re.Pattern[str]], ...]:
-    """Patterns, most fixed characters first: "lost" must not be read as "lost: {why}"."""
-    found = [(spec.id, _pattern(spec.template)) for spec in CATALOGUE.values()]
-    return tuple(sorted(found, key=lambda one: -len(_FIELD.sub("", CATALOGUE[one[0]].template))))
-
-
-def _pattern(template: str) -> re.Pattern[str]:
-    parts = _FIELD.split(template)  # text, name, text, name, ..., text
-    made = (f"(?P<{p}>.*)" if i % 2 else re.escape(p) for i, p in enumerate(parts))
-    return re.compile("".join(made))
-
-
-def values_of(statustext: str) -> tuple[AlertId, dict[str, str]] | None:
-    """Identifier and shown values of an active alert's text; None for other texts."""
-    for of, pattern in _patterns():
-        match = pattern.fullmatch(statustext)
-        if match is not None:
-            return of, match.groupdict()
-    return None
-
-
-def alert_of(statustext: str) -> tuple[AlertId, bool] | None:
-    """Identifier of a text's alert, and whether the alert is active; None for other texts."""
-    read = values_of(statustext)
-    if read is not None:
-        return read[0], True
-    ended = (
-        spec.id
-        for spec in CATALOGUE.values()
-        if spec.reports_end and text(cleared(spec.id)) == statustext
-    )
-    of = next(ended, None)
-    return None if of is None else (of, False)
-
 
 _GROUPS = (INTEGRITY, MONITOR, SOURCES, INJECTION, VEHICLE, HEALTH, TARGETS, CONSOLE)
 

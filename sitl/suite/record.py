@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mavlink_bridge.alerts.catalogue import alert_of, values_of
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import alert_of, values_of
 from mavlink_bridge.messages import Figures
 
 Array = NDArray[np.float64]

@@ -26,8 +26,8 @@ from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from mavlink_bridge import Bridge, BridgeConfig
-from mavlink_bridge.alerts.catalogue import alert_of
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import alert_of
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import (

@@ -1,11 +1,11 @@
 """``python -m sitl``: nothing of the user's is removed or written over."""
 
 import pytest
-from sitl.vehicles.ardupilot import ArduPilotNotFoundError
 from typer.testing import CliRunner
 
 from sitl import __main__ as cli
 from sitl.demo.scenario import ScenarioError
+from sitl.vehicles.launch import ArduPilotNotFoundError
 
 
 @pytest.fixture(autouse=True)

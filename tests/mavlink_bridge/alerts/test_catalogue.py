@@ -15,16 +15,9 @@ from mavlink_bridge.alerts.alert import (
     Severity,
     Value,
 )
-from mavlink_bridge.alerts.catalogue import (
-    CATALOGUE,
-    TEXT_LENGTH,
-    alert,
-    alert_of,
-    cleared,
-    severity,
-    text,
-)
+from mavlink_bridge.alerts.catalogue import CATALOGUE, TEXT_LENGTH, alert, cleared, severity, text
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import alert_of
 from mavlink_bridge.alerts.words import ChosenSet, Name, RcChannel, Word
 from mavlink_bridge.link.tlog import PART, WHOLE
 

@@ -14,7 +14,7 @@ from mavlink_bridge.alerts.ids import AlertId
 
 ROOT = Path(__file__).parents[3]
 ALERTS = "mavlink_bridge/alerts/"
-READS = "mavlink_bridge.alerts.catalogue"
+READS = "mavlink_bridge.alerts.reading"
 RENDERS = {"text", "body", "reason"}
 EDGES = {  # STATUSTEXT, records and pages
     "mavlink_bridge/status.py", "mavlink_bridge/injection/shadow.py",
@@ -28,7 +28,7 @@ PARSES = {  # methods of a text, and of `re`
 }  # fmt: skip
 OUTSIDE = {  # why a value is a `Name` and none of a closed list
     "mavlink_bridge/bridge.py": "the system's error",
-    "mavlink_bridge/ground.py": "an address",
+    "mavlink_bridge/components.py": "an address",
     "mavlink_bridge/vehicle/unexpected_senders.py": "an address",
     "mavlink_bridge/injection/fix_sender.py": "a MAVLink message of the configuration",
     "companion/flight/component_table.py": "an address",

@@ -21,8 +21,8 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest, VisionFix
-from mavlink_bridge.alerts.catalogue import values_of
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.alerts.reading import values_of
 from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
