@@ -1,13 +1,6 @@
-<<<<<<< HEAD
-"""The catalogue: one row for each alert. All texts and tables are made from it, and read by it."""
+"""The catalogue: one row for each alert. All texts and tables are made from it."""
 
 from __future__ import annotations
-
-import re
-from functools import cache
-=======
-"""The catalogue: one row for each alert. All texts and tables are made from it."""
->>>>>>> a4aca9fa (alerts: keep the reader of texts apart, as its test asks)
 
 from mavlink_bridge.alerts.alert import PREFIX, Alert, AlertSpec, Severity, Value
 from mavlink_bridge.alerts.companion import CONSOLE, HEALTH, TARGETS
