@@ -157,7 +157,7 @@ class RegistrationStatus(Enum):
 
     OK = "ok"
     NO_OVERLAP = "no overlap: too few anchors project into the image"
-    NO_TEXTURE = "no texture: the normal equations are singular"
+    NO_TEXTURE = "the pose is not determined: no texture, or the start is too far off"
     BAD_FEATURES = "features are not finite"
     TOO_FEW_ANCHORS = "too few anchors in the reference view"
     NOT_TRIED = "not tried: elsewhere the map looks more like the image"

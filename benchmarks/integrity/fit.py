@@ -106,9 +106,10 @@ def fitted_model(sets: Sequence[Labelled]) -> PlaceModel:
 def _regression(sets: Sequence[Labelled]) -> PlaceModel:
     """Logistic regression with a small ridge."""
     x = np.concatenate([s.features for s in sets])
+    x[np.isinf(x)] = np.nan
     y, weight = (np.concatenate([getattr(s, key) for s in sets]) for key in ("right", "weights"))
-    mean, spread = x.mean(axis=0), x.std(axis=0)
-    z = np.column_stack([(x - mean) / spread, np.ones(len(x))])
+    mean, spread = np.nanmean(x, axis=0), np.nanstd(x, axis=0)
+    z = np.column_stack([np.nan_to_num((x - mean) / spread), np.ones(len(x))])
     share = weight / weight.sum()
 
     def loss(b: Array) -> tuple[float, Array]:

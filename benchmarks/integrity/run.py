@@ -34,6 +34,7 @@ _LEAST_MAP = 0.1  # of a reference view, as in flight: with less there is no reg
 _BYTES = 96 * 2**20  # of a map's resident tiles
 _PLACES = 48  # at which views of other places are tried
 _FAR_M = 1e6  # error where the place is not on the map
+_NO_RIVAL = 1e3  # lead where there is no other mode: JSON has no infinity
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class StartOutcome:
     def evidence(self) -> Array:
         """(5,), as `localizer.integrity.probability` has it."""
         votes = PatchAgreement(self.parts, self.votes, self.peak, self.patch_peak)
-        return evidence(self.quality, votes, self.lead)
+        return evidence(self.quality, votes, self.lead if self.lead < _NO_RIVAL else np.inf)
 
     @property
     def right(self) -> bool:
@@ -185,7 +186,7 @@ def _outcome(
         votes=votes.votes,
         peak=votes.peak,
         patch_peak=votes.patch_peak,
-        lead=min(found.lead, 1e3),
+        lead=min(found.lead, _NO_RIVAL),
         focal_gain=max(found.focal_gain, -1.0),
         prior_sigma_m=horizontal_sigma_m(begun.prior),
     )

@@ -149,6 +149,8 @@ def main() -> None:
         stages, features = data["stages"], data["features"]
     except (ValueError, KeyError, TypeError) as error:
         raise ReportError(f"{args.bench}: not of `companion self-test --bench --out`") from error
+    if not stages:
+        raise ReportError(f"{args.bench}: no stages: give --bench to `companion self-test`")
     if "onnxruntime, CPU" not in features:
         raise ReportError(f"{args.bench}: {features}: float32 of onnxruntime on the CPU is needed")
     show_figures(args.json, COLUMNS, estimates(stages))

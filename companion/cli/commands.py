@@ -23,7 +23,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from companion.cli.interrupts import INTERRUPTED
+from companion.cli.interrupts import INTERRUPTED, end_at_once
 from companion.cli.output import tell
 from companion.errors import CompanionError, ConfigError
 from companion.versions import versions
@@ -68,6 +68,10 @@ class _ImportedCommands(Mapping[str, Any]):
         alone.command(name)(found)
         return typer.main.get_command(alone)
 
+    def get(self, name: str, default: Any = None) -> Any:
+        """A KeyError of the import is not "no such command"."""
+        return self[name] if name in _COMMANDS else default
+
     def __iter__(self) -> Iterator[str]:
         return iter(_COMMANDS)
 
@@ -87,7 +91,10 @@ class _Commands(TyperGroup):
         ):
             if option.startswith("--") and re.fullmatch(r"(?i)[+-]?(nan|inf(inity)?)", value):
                 raise ConfigError(f"{option} {value}: give a finite number")
-        return super().resolve_command(ctx, args)
+        found = super().resolve_command(ctx, args)
+        if signal.getsignal(signal.SIGINT) is end_at_once:  # the command is imported
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return found
 
 
 app = typer.Typer(
@@ -119,7 +126,6 @@ def _options(
 def main() -> None:
     """Entry point: named errors become one clear line and exit code 2."""
     try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # the imports are over
         app()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

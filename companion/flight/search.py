@@ -84,6 +84,8 @@ class RelocalizationHypothesis:
         way, sigma_m = np.zeros(2), _speed_sigma(velocity) * elapsed_s
         if velocity is not None:
             way = velocity[:2] * elapsed_s
+            if elapsed_s > _LATE_S:  # that of now: it may have circled where it was found
+                way, sigma_m = way / 2.0, sigma_m + float(np.linalg.norm(way)) / 2.0
         elif self.reachable is not None and reachable is not None:
             by_imu, grown_m = (
                 reachable.centre - self.reachable.centre,
@@ -237,6 +239,8 @@ class PlaceSearch:
         if query is None:
             return None
         seen, self._hypothesis = self._hypothesis, None
+        if seen and self._hint and self._hint[1] > 1e-9 * seen.found.exposure_time_ns:
+            seen = None  # the operator knows it since
         velocity, about = self._autopilot.velocity, self._reach(frame.exposure_time_ns)
         predicted = seen.predicted_query(query, velocity, about) if seen is not None else None
         began = self._clock()

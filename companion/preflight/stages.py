@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +15,6 @@ from companion.integrity_monitor.video import FrozenVideoDetector
 from localizer.config import LocalizerConfig
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import FeatureExtractor
-from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
-from localizer.map.cache.tile import TileMesh
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.tracking.opening import MapStack
@@ -65,21 +63,12 @@ class _Renderer(MapRenderer):
         super().__init__(base.streamer)
         self._base, self._watch, self.name = base, watch, base.name
 
-    def render(
-        self,
-        world_from_camera: Pose,
-        camera: Camera,
-        extra: Sequence[TileMesh] = (),
-        *,
-        wait: bool = False,
-    ) -> RenderedView:
+    def render(self, *args: Any, **named: Any) -> RenderedView:
         with self._watch.of("render"):
-            return self._base.render(world_from_camera, camera, extra, wait=wait)
+            return self._base.render(*args, **named)
 
-    def draw(
-        self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
-    ) -> RenderedView:
-        return self._base.draw(meshes, world_from_camera, camera)
+    def draw(self, *args: Any) -> RenderedView:
+        return self._base.draw(*args)
 
     def close(self) -> None:
         self._base.close()

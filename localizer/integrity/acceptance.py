@@ -24,8 +24,8 @@ class IntegrityConfig(BaseModel):
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     # Of 6,301 wrong registrations of ten maps, each by a fit without its kind of map, the highest
-    # lie at 2.7 on an outdated map, at 1.6 among equal roofs, and at -1.8 on all others;
-    # of 2,895 dark ones, at 0.8.
+    # lie at 2.9 on an outdated map, at 1.7 among equal roofs, and at -1.8 on all others; of 2,895
+    # dark ones, at -0.6.
     min_log_odds: float = Field(
         0.7,
         ge=-20,

@@ -31,7 +31,8 @@ _LEAST_QUALITY, _LEAST_LEAD = 0.02, 0.003  # below, a logarithm says no more
 @dataclass(frozen=True)
 class PlaceModel:
     """Logistic regression of whether a registration is at the right position. Log odds = bias + sum
-    of weights times (feature - mean) / spread; arrays are (5,), in the order of `FEATURES`.
+    of weights times (feature - mean) / spread; arrays are (5,), in the order of `FEATURES`. A
+    feature that is infinite has no weight.
     """
 
     mean: Array
@@ -41,7 +42,8 @@ class PlaceModel:
 
     def log_odds(self, features: Array) -> float:
         """Natural log odds of the right position, for equal prior probabilities."""
-        return float(self.bias + self.weights @ ((features - self.mean) / self.spread))
+        known = np.where(np.isposinf(features), self.mean, features)
+        return float(self.bias + self.weights @ ((known - self.mean) / self.spread))
 
 
 @cache
@@ -77,7 +79,8 @@ def place_features(result: Registration) -> Array | None:
 
 def evidence(quality: float, votes: PatchAgreement, lead: float) -> Array:
     """Evidence (5,) from the values of a `Registration`. quality: 0 to 1; lead: relative cost
-    margin over the second-best mode.
+    margin over the second-best mode, inf without one. That is no evidence: a narrow prior leaves
+    room for no other mode, at a wrong position as well.
     """
     return np.array(
         [
@@ -85,7 +88,7 @@ def evidence(quality: float, votes: PatchAgreement, lead: float) -> Array:
             np.sqrt(votes.patches) * (votes.share - _CHANCE),
             votes.peak,
             votes.patch_peak,
-            np.log(np.clip(lead, _LEAST_LEAD, 1.0)),
+            np.inf if lead == np.inf else np.log(np.clip(lead, _LEAST_LEAD, 1.0)),
         ]
     )
 

@@ -38,7 +38,7 @@ class OdometryConfig:
     anchors: int = 3000  # anchors per keyframe
     min_overlap: float = 0.35  # share of a keyframe's anchors in view of a usable frame
     max_sigma_m: float = 2.0  # position sigma of a usable registration
-    min_log_odds: float = 1.0  # of image and prediction together, as `IntegrityConfig`'s
+    min_log_odds: float = 1.0  # of image and prediction together
     new_below_overlap: float = 0.7  # overlap below which a new keyframe starts
     new_below_quality: float = 0.6  # quality, as a share of the keyframe's first, likewise
     new_beyond_turn_deg: float = 25.0  # turn since the keyframe that starts a new one

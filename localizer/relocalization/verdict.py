@@ -12,7 +12,7 @@ from localizer.types import PosePrior
 
 NEARLY = 0.8  # of the winner's correlation: a place that has to be looked at, too
 _STANDS_OUT = 1.5  # times the quality of any other place. Equal houses: 1.0 to 1.19
-CREDIBLE = 2.0  # log odds: more than of a tracked frame, because many positions are compared
+CREDIBLE = 1.0  # log odds beyond those of a tracked frame, because many positions are compared
 DECISIVE = 6.0  # log odds: the image alone leaves no doubt
 SAME_PLACE_M = 5.0  # answers that are closer are one
 

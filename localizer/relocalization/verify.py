@@ -206,7 +206,7 @@ class Verifier:
             reach = self.config.heading_reach * query.heading_sigma_rad
             if abs(heading) > reach + 3 * _HEADING_SIGMA_RAD:
                 return False
-        return log_odds(result) >= CREDIBLE
+        return log_odds(result) >= self.integrity.min_log_odds + CREDIBLE
 
 
 def _constraints(pose: Pose, query: PlaceQuery) -> tuple[PoseConstraint, PoseConstraint]:

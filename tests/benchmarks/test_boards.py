@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import sys
+
 import pytest
 
-from benchmarks.throughput.boards import network_counts
+from benchmarks.throughput.boards import main, network_counts
+from companion.errors import ReportError
 
 
 def test_four_times_the_pixels_are_four_times_the_operations():
@@ -12,3 +16,11 @@ def test_four_times_the_pixels_are_four_times_the_operations():
     assert four_macs == pytest.approx(4 * macs)
     assert 3.0 * moved < four_moved < 4.0 * moved  # the weights stay the same
     assert macs * 1e6 > 64 * 48  # a multiplication a pixel, and not of pixels alone
+
+
+def test_a_self_test_without_bench_has_no_stages(tmp_path, monkeypatch):
+    told = tmp_path / "plain.json"
+    told.write_text(json.dumps({"stages": [], "features": "tiny (onnxruntime, CPU) + detail"}))
+    monkeypatch.setattr(sys, "argv", ["boards", str(told)])
+    with pytest.raises(ReportError, match="--bench"):
+        main()

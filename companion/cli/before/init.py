@@ -173,6 +173,8 @@ def _model(
             )
         return lens.to_dict()
     width, height = size or (1280, 720)
+    if size is None:
+        notes.append(f"{width}x{height} is assumed: check width, height of camera.model")
     notes.append("camera.model is a field of view, not a calibration: docs/tutorials/my-camera.md")
     return Camera.from_fov(width, height, fov or _DEFAULT_FOV_DEG).to_dict()
 

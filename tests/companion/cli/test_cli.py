@@ -56,6 +56,20 @@ setattr(module[part], part, make)
 main()
 """
 
+# The same while the called command is imported.
+INTERRUPTED_IN_AN_IMPORT = """
+import ctypes, os, signal, sys
+from companion.__main__ import main
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "companion.cli.key":
+            ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()
+
+sys.meta_path.insert(0, Finder())
+main()
+"""
+
 
 def _config(tmp_path, **changes):
     config = {
@@ -119,6 +133,12 @@ def test_an_interrupt_is_not_lost_in_a_callback_of_the_way_up(map_cache, tmp_pat
     assert (process.returncode, err) == (130, "")
     assert "went on" not in out
     assert not (tmp_path / "record").exists()
+
+
+def test_an_interrupt_is_not_lost_in_the_import_of_a_command():
+    process = _process("-c", INTERRUPTED_IN_AN_IMPORT, "key")
+    out, err = process.communicate(timeout=START_S)
+    assert (process.returncode, out, err) == (130, "", "")
 
 
 def test_a_port_in_use_is_told_before_anything_is_compiled(map_cache, tmp_path, monkeypatch):

@@ -243,6 +243,25 @@ def test_a_place_of_long_ago_says_nothing(slowly):
     assert slow.queries[1].region.centre == pytest.approx([0.0, 0.0])
 
 
+def test_an_operators_word_comes_before_what_was_found_earlier(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    assert search.search(falling.frame(), lambda: False) is None
+    search.hint(500.0, 10.0, 30.0)
+    search.search(falling.frame(), lambda: False)
+    assert slow.queries[1].region.centre == pytest.approx([500.0, 10.0])
+
+
+def test_after_a_long_search_it_is_looked_for_where_it_circled_and_straight_on(slowly):
+    falling = Falling(np.array([20.0, 0.0, -2.0]))
+    search, slow = slowly(falling)
+    slow.wide_s = 45.0
+    assert search.search(falling.frame(), lambda: False) is None
+    search.search(falling.frame(), lambda: False)
+    for place in ([0.0, 10.0], [900.0, 10.0]):
+        assert slow.queries[1].region.contains(np.array(place))
+
+
 @pytest.mark.parametrize(
     ("jump_m", "centre", "radius_m"),
     [(0.0, 12.0, 14.0), (60.0, 0.0, 42.0), (None, 12.0, 18.0)],

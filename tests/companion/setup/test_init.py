@@ -104,6 +104,7 @@ def test_map_and_stream_are_asked_and_a_silent_vehicle_is_noted(
     assert config.bridge.mode == "shadow"
     assert "no vehicle was heard" in text
     assert "not a calibration" in text
+    assert "is assumed" not in text
     assert len(text.splitlines()) < 25
     again = CliRunner().invoke(app, ["init", str(out)], input=answers)
     assert again.exit_code != 0
@@ -147,6 +148,7 @@ def test_without_a_map_a_file_is_written_that_says_what_is_missing(tmp_path, mon
     assert f"--out {place}" in (tmp_path / "d.yaml").read_text()
     config = load_config(tmp_path / "d.yaml")
     assert (config.map, config.map_sha256) == (tmp_path / place, None)
+    assert "1280x720 is assumed: check width, height" in done.output
 
 
 def test_a_full_disk_leaves_the_old_file_and_names_the_new_one(tmp_path, monkeypatch):

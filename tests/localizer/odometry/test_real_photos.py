@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
@@ -69,7 +70,7 @@ class PhotoFlight:
         prior = PosePrior(prediction, PREDICTED, BEGIN_NS + STEP_NS)
         return odometry.step(self.frame(seen, BEGIN_NS + STEP_NS), prior, surface=surface)
 
-    def _sees(self, name: str, points: Array) -> Array:
+    def _sees(self, name: str, points: Array) -> NDArray[np.bool_]:
         return self.camera.project(self.poses[name].inverse.apply(points))[1]
 
 
