@@ -2,8 +2,8 @@
 
 A sum of hypotheses (Alspach and Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
 approximations"), one for each surface; hypotheses of different surfaces are never averaged. Each is
-an interacting-multiple-model filter (Blom and Bar-Shalom 1988) of a standing target and of one with
-constant velocity. The errors of pose and map repeat in all frames of one view, so they are states
+an interacting-multiple-model filter (Blom and Bar-Shalom 1988) of a target that stands, of one with
+constant velocity, and of one that changes it. The errors of pose and map repeat in all frames of one view, so they are states
 too: many frames of one view do not claim more than its pose and map allow.
 """
 
@@ -19,12 +19,14 @@ from filterpy.kalman import IMMEstimator, KalmanFilter
 from localizer.geometry.pose import Array
 from localizer.types import TargetSurface
 
-# Spectral density of a target's acceleration, east north up, m²/s³: 0.3 m/s in a second is a car in
-# traffic, 0.15 m/s the slope of its road.
-_ACCELERATION = (0.45, 0.45, 0.02)
+# The models: it stands, drives on, or turns, starts and brakes. Mean time in each, s, and spectral
+# density of its acceleration, east north up, m²/s³: 0.3 m/s in a second is a car in traffic, 0.15
+# m/s the slope of its road; 3 m/s² for a second, either way, a corner.
+_LASTS_S = np.array([60.0, 30.0, 2.0])
+_ACCELERATION = ((0.0, 0.0, 0.0), (0.45, 0.45, 0.02), (18.0, 18.0, 0.02))
+_STANDING, _MOVING = 0, slice(1, 3)
 _SPEED_SIGMA = (10.0, 10.0, 2.0)  # m/s, of a target that begins to move
-_STANDS_S, _MOVES_S = 60.0, 30.0  # mean times: of a halt, and of a drive between two
-_SAME_VIEW = float(np.cos(np.radians(2.0)))  # views that differ less repeat the pose's error
+_SAME_VIEW = float(np.cos(np.radians(4.0)))  # views that differ less repeat the pose's error
 _GATE = 25.0  # chi-square of 2 dimensions: 1 in 300,000 is beyond
 _MISSED = 1e-3  # likelihood of a pixel that shows something else
 _BORN = 0.05  # probability of a surface that was not in the first sighting
@@ -38,7 +40,6 @@ _SAME = 1.0  # squared Mahalanobis distance below which two hypotheses are one
 _ELSEWHERE = 9.0  # and above which one is another place than the reported one
 _FAR_M = 300.0  # sigma of what a ray alone does not tell
 _GRAZING = 0.05  # cosine: what is seen at less than 3 degrees is met at its middle
-_STANDING, _MOVING = 0, 1
 # The state: position m, velocity m/s, and the view's error m.
 _P, _V, _E = slice(0, 3), slice(3, 6), slice(6, 9)
 _H = np.hstack([np.eye(3), np.zeros((3, 3)), np.eye(3)])
@@ -88,6 +89,15 @@ class _Hypothesis:
         covariance: Array = self.models.P[_P, _P]
         return covariance
 
+    @property
+    def motion(self) -> tuple[Array, Array]:
+        """Velocity (3,) and covariance (3, 3) of the models that move."""
+        models, shares = self.models.filters[_MOVING], self.models.mu[_MOVING]
+        velocities = np.array([model.x[_V] for model in models])
+        return np.average(velocities, axis=0, weights=shares), np.cov(
+            velocities.T, aweights=shares, ddof=0
+        ) + np.average([model.P[_V, _V] for model in models], axis=0, weights=shares)
+
 
 class TargetFilter:
     """Tracks one target; not thread-safe."""
@@ -100,7 +110,7 @@ class TargetFilter:
     @property
     def moves(self) -> bool:
         """Whether the target more probably moves than stands."""
-        return bool(self._hypotheses) and self._hypotheses[0].models.mu[_MOVING] > 0.5
+        return bool(self._hypotheses) and self._hypotheses[0].models.mu[_STANDING] < 0.5
 
     @property
     def position(self) -> Array:
@@ -111,18 +121,12 @@ class TargetFilter:
     @property
     def velocity(self) -> Array | None:
         """Velocity (3,), m/s, world, of a target that moves; None otherwise."""
-        if not self.moves:
-            return None
-        velocity: Array = self._hypotheses[0].models.filters[_MOVING].x[_V].copy()
-        return velocity
+        return self._hypotheses[0].motion[0] if self.moves else None
 
     @property
     def velocity_covariance(self) -> Array | None:
         """Covariance (3, 3) m²/s² of `velocity`, of the reported surface alone."""
-        if not self.moves:
-            return None
-        covariance: Array = self._hypotheses[0].models.filters[_MOVING].P[_V, _V].copy()
-        return covariance
+        return self._hypotheses[0].motion[1] if self.moves else None
 
     def expected(self, time_ns: int) -> tuple[Array, Array]:
         """Predicted position (3,), world m, and covariance (3, 3) of the most probable surface
@@ -187,34 +191,34 @@ def _begun(likelihood: float, sighting: _Sighting, surface: TargetSurface) -> _H
     P[_P, _E] = P[_E, _P] = -surface.repeats
     P[_V, _V] = np.diag(np.square(_SPEED_SIGMA))
     models = []
-    for _ in (_STANDING, _MOVING):
+    for _ in _LASTS_S:
         model = KalmanFilter(9, 3)
         model.x, model.P, model.H = x.copy(), P.copy(), _H
         models.append(model)
-    shares = np.array([_STANDS_S, _MOVES_S]) / (_STANDS_S + _MOVES_S)
-    return _Hypothesis(
-        likelihood, IMMEstimator(models, shares, np.eye(2)), surface.repeats, (surface.probability,)
-    )
+    estimator = IMMEstimator(models, _LASTS_S / _LASTS_S.sum(), np.eye(len(models)))
+    return _Hypothesis(likelihood, estimator, surface.repeats, (surface.probability,))
 
 
 def _copied(h: _Hypothesis, changes: Array) -> IMMEstimator:
-    """A copy whose predictions and updates leave the original unchanged. changes: (2, 2)
+    """A copy whose predictions and updates leave the original unchanged. changes: (3, 3)
     probabilities of the next model, by the present one.
     """
     return IMMEstimator([copy(model) for model in h.models.filters], h.models.mu, changes)
 
 
 def _predicted(h: _Hypothesis, elapsed_s: float, is_new_view: bool) -> _Hypothesis:
-    begins, ends = 1.0 - np.exp(-elapsed_s / np.array([_STANDS_S, _MOVES_S]))
-    models = _copied(h, np.array([[1.0 - begins, begins], [ends, 1.0 - ends]]))
-    standing, moving = models.filters
-    standing.F, standing.Q = np.eye(9), np.zeros((9, 9))
-    if is_new_view:
-        standing.F[_E, _E], standing.Q[_E, _E] = np.zeros((3, 3)), h.repeats
-    moving.F, moving.Q = standing.F.copy(), standing.Q.copy()
-    standing.F[_V, _V], standing.Q[_V, _V] = np.zeros((3, 3)), np.diag(np.square(_SPEED_SIGMA))
-    moving.F[_P, _V] = elapsed_s * np.eye(3)
-    moving.Q[:6, :6] = np.kron(Q_continuous_white_noise(2, elapsed_s), np.diag(_ACCELERATION))
+    stays = np.exp(-elapsed_s / _LASTS_S)
+    n = len(stays)
+    changes = np.diag(stays) + (1.0 - np.eye(n)) * (1.0 - stays)[:, None] / (n - 1)
+    models = _copied(h, changes)
+    for model, density in zip(models.filters, _ACCELERATION, strict=True):
+        model.F, model.Q = np.eye(9), np.zeros((9, 9))
+        model.F[_P, _V] = elapsed_s * np.eye(3)
+        model.Q[:6, :6] = np.kron(Q_continuous_white_noise(2, elapsed_s), np.diag(density))
+        if is_new_view:
+            model.F[_E, _E], model.Q[_E, _E] = np.zeros((3, 3)), h.repeats
+    standing = models.filters[_STANDING]
+    standing.F[:, _V], standing.Q[_V, _V] = np.zeros((9, 3)), np.diag(np.square(_SPEED_SIGMA))
     models.predict()
     return replace(h, models=models)
 
@@ -238,15 +242,15 @@ def _met(h: _Hypothesis, sighting: _Sighting) -> _Hypothesis:
     likelihood = h.likelihood * height * float(models.likelihood @ h.models.cbar)
     on = [s for s in sighting.surfaces if _is_on(h, s, d)]
     share = sum(s.probability for s in on)
-    moving = models.filters[_MOVING]
     off = float((nearest.position - h.position) @ d)
-    if off**2 <= _GATE * float(d @ (nearest.covariance + moving.P[_P, _P]) @ d):
-        moving.R = nearest.covariance + _FAR_M**2 * np.eye(3) - along
-        moving.update(nearest.position)
+    if off**2 <= _GATE * float(d @ (nearest.covariance + models.P[_P, _P]) @ d):
+        for model in models.filters[_MOVING]:
+            model.R = nearest.covariance + _FAR_M**2 * np.eye(3) - along
+            model.update(nearest.position)
         models = IMMEstimator(models.filters, models.mu, models.M)
     # What is wrong with the map's edge is wrong in all frames of one place; what moves leaves it.
-    stands, moves = models.mu
-    likelihood *= max(share, _UNSEEN) ** moves
+    stands = models.mu[_STANDING]
+    likelihood *= max(share, _UNSEEN) ** (1.0 - stands)
     met = _Hypothesis(likelihood, models, nearest.repeats, (*h.shares, share)[-_BUNDLES:], h.sight)
     if sighting.is_new_view:
         return replace(met, shares=(share,), sight=h.sight * h.share**stands)
@@ -259,11 +263,15 @@ def _is_within(a: _Hypothesis, b: _Hypothesis) -> bool:
 
 
 def _reduced(hypotheses: list[_Hypothesis]) -> list[_Hypothesis]:
-    """The hypotheses by falling weight, normalised; equal ones are joined, negligible dropped."""
+    """The hypotheses, normalised; equal ones are joined, negligible dropped. The first is that of
+    the smallest expected error.
+    """
     kept: list[_Hypothesis] = []
     total = sum(h.weight for h in hypotheses)
     for h in sorted(hypotheses, key=lambda h: -h.weight):
         is_new = not any(_is_within(h, k) and _is_within(k, h) for k in kept)
         if is_new and len(kept) < _MOST and h.weight >= _NEGLIGIBLE * total:
             kept.append(replace(h, likelihood=h.likelihood / total))
-    return kept
+    at, weights = np.array([h.position for h in kept]), np.array([h.weight for h in kept])
+    first = int(np.argmin(np.linalg.norm(at[:, None] - at, axis=2) @ weights))
+    return [kept.pop(first), *kept]
