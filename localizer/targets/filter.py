@@ -21,9 +21,9 @@ from localizer.types import TargetSurface
 
 # The models: it stands, drives on, or turns, starts and brakes. Mean time in each, s, and spectral
 # density of its acceleration, east north up, m²/s³: 0.3 m/s in a second is a car in traffic, 0.15
-# m/s the slope of its road; 3 m/s² for a second, either way, a corner.
+# m/s the slope of its road; 7 m/s² for a second, what tyres hold.
 _LASTS_S = np.array([60.0, 30.0, 2.0])
-_ACCELERATION = ((0.0, 0.0, 0.0), (0.45, 0.45, 0.02), (18.0, 18.0, 0.02))
+_ACCELERATION = ((0.0, 0.0, 0.0), (0.45, 0.45, 0.02), (100.0, 100.0, 0.02))
 _STANDING, _MOVING = 0, slice(1, 3)
 _SPEED_SIGMA = (10.0, 10.0, 2.0)  # m/s, of a target that begins to move
 _SAME_VIEW = float(np.cos(np.radians(4.0)))  # views that differ less repeat the pose's error
@@ -215,7 +215,7 @@ def _predicted(h: _Hypothesis, elapsed_s: float, is_new_view: bool) -> _Hypothes
         model.F, model.Q = np.eye(9), np.zeros((9, 9))
         model.F[_P, _V] = elapsed_s * np.eye(3)
         model.Q[:6, :6] = np.kron(Q_continuous_white_noise(2, elapsed_s), np.diag(density))
-        if is_new_view:
+        if is_new_view or any(density):
             model.F[_E, _E], model.Q[_E, _E] = np.zeros((3, 3)), h.repeats
     standing = models.filters[_STANDING]
     standing.F[:, _V], standing.Q[_V, _V] = np.zeros((9, 3)), np.diag(np.square(_SPEED_SIGMA))
@@ -234,7 +234,7 @@ def _met(h: _Hypothesis, sighting: _Sighting) -> _Hypothesis:
     along = _FAR_M**2 * np.outer(d, d)
     models = _copied(h, h.models.M)
     for model in models.filters:
-        model.R = nearest.covariance + along
+        model.R = nearest.covariance - nearest.repeats + along
     models.update(eye + d * float((h.position - eye) @ d))
     if min(model.mahalanobis for model in models.filters) ** 2 > _GATE:
         return replace(h, likelihood=h.likelihood * _MISSED, is_seen=False)
@@ -244,8 +244,18 @@ def _met(h: _Hypothesis, sighting: _Sighting) -> _Hypothesis:
     share = sum(s.probability for s in on)
     off = float((nearest.position - h.position) @ d)
     if off**2 <= _GATE * float(d @ (nearest.covariance + models.P[_P, _P]) @ d):
-        for model in models.filters[_MOVING]:
-            model.R = nearest.covariance + _FAR_M**2 * np.eye(3) - along
+        across = _FAR_M**2 * np.eye(3) - along
+        known, told = (
+            float(d @ models.filters[_STANDING].P[_P, _P] @ d),
+            float(d @ nearest.covariance @ d),
+        )
+        for k, model in enumerate(models.filters):
+            if k == _STANDING:
+                if told >= known:
+                    continue
+                model.R = across + np.outer(d, d) * told * known / (known - told)
+            else:
+                model.R = nearest.covariance + across
             model.update(nearest.position)
         models = IMMEstimator(models.filters, models.mu, models.M)
     # What is wrong with the map's edge is wrong in all frames of one place; what moves leaves it.
