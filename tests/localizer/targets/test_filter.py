@@ -100,6 +100,20 @@ def test_two_surfaces_are_reported_as_one_with_the_spread_of_both():
         assert elsewhere == pytest.approx(0.4, abs=0.15)
 
 
+@pytest.mark.parametrize(("turned_deg", "least", "most"), [(0.0, 0.1, 0.55), (20.0, 0.0, 0.01)])
+def test_a_surface_that_later_frames_show_counts_unless_an_earlier_view_was_beside_it(
+    turned_deg, least, most
+):
+    target = TargetFilter()
+    turn = np.radians(turned_deg)
+    eye = 100.0 * np.array([np.sin(turn), 0.0, np.cos(turn)])
+    for k in range(4):
+        _see(target, k, GROUND, (1.0, GROUND[2]), eye=np.array([0.0, 0.0, 100.0]))
+    for k in range(4, 16):
+        _see(target, k, GROUND, (0.5, GROUND[2]), (0.5, ROOF[2]), eye=eye)
+    assert least <= _place(target)[2] <= most
+
+
 @pytest.mark.parametrize("place", [ROOF, GROUND])
 def test_views_from_several_sides_decide_without_the_maps_help(place):
     rng = np.random.default_rng(2)
