@@ -40,6 +40,7 @@ from sitl.demo.scenario import (
     scenario_names,
 )
 from sitl.errors import FlightError, SimulationError
+from sitl.geodesy import Location
 from sitl.operator.follow_run import fly_follows
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
@@ -49,6 +50,7 @@ from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
 from sitl.suite.report import markdown as suite_table
 from sitl.suite.report import print_row, write_report
 from sitl.suite.runner import run_suite
+from sitl.vehicles.launch import open_vehicle
 from sitl.vehicles.process import VehicleKind
 
 # What a flight and its report leave in their folder.
@@ -100,6 +102,7 @@ def demo(
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
     script = _script(scenario, ideal, injection=injection)
+    open_vehicle(fc, Location(0.0, 0.0, 0.0))  # its errors come before minutes of generating
     console = Console()
     if map_ is not None:
         rehearsal = rehearse(map_, live, mission, script)
