@@ -28,7 +28,7 @@ _LASTS_S = np.array([60.0, 30.0, 2.0])
 _ACCELERATION = ((0.0, 0.0, 0.0), (0.45, 0.45, 0.02), (100.0, 100.0, 0.02))
 _STANDING, _MOVING = 0, slice(1, 3)
 _SPEED_SIGMA = (10.0, 10.0, 2.0)  # m/s, of a target that begins to move
-_ALIKE = np.radians(3.0)  # by which the view turns until its error has changed to a third
+_ALIKE = np.radians(3.0)  # turn of the view after which its error is a third alike
 _SAME_VIEW = float(np.cos(np.radians(4.0)))  # what is wrong with the map's edges stays the same
 _GATE = 25.0  # chi-square of 2 dimensions: 1 in 300,000 is beyond
 _MISSED = 1e-3  # likelihood of a pixel that shows something else
@@ -235,7 +235,7 @@ def _copied(h: _Hypothesis, changes: Array) -> IMMEstimator:
 
 
 def _predicted(h: _Hypothesis, elapsed_s: float, turn: float) -> _Hypothesis:
-    """turn: of the view meanwhile, rad; what moves shows another side soon, so nothing is alike."""
+    """turn: of the view meanwhile, rad. To a target that moves, the view's errors are white."""
     stays = np.exp(-elapsed_s / _LASTS_S)
     n = len(stays)
     changes = np.diag(stays) + (1.0 - np.eye(n)) * (1.0 - stays)[:, None] / (n - 1)
