@@ -25,7 +25,7 @@ from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 from sitl.errors import SimulationError
-from sitl.vehicles.ardupilot import find_arducopter
+from sitl.vehicles.launch import find_arducopter
 from tests.parts import PARTS, SHARED_FOLDER, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen

@@ -153,7 +153,11 @@ def main() -> None:
         raise ReportError(f"{args.bench}: no stages: give --bench to `companion self-test`")
     if "onnxruntime, CPU" not in features:
         raise ReportError(f"{args.bench}: {features}: float32 of onnxruntime on the CPU is needed")
-    show_figures(args.json, COLUMNS, estimates(stages))
+    try:
+        rows = estimates(stages)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ReportError(f"{args.bench}: stages: not of `companion self-test --bench`") from error
+    show_figures(args.json, COLUMNS, rows)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from companion.geometry import (
 )
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
-from localizer.geometry.posefile import pose_row
+from localizer.geometry.trajectory import pose_row
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 from tests.companion.estimates import estimated
 

@@ -5,6 +5,7 @@ from typer.testing import CliRunner
 
 from sitl import __main__ as cli
 from sitl.demo.scenario import ScenarioError
+from sitl.vehicles.launch import ArduPilotNotFoundError
 
 
 @pytest.fixture(autouse=True)
@@ -64,3 +65,11 @@ def test_the_injection_is_named_and_reaches_the_flight(tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         _run("demo", "--injection", "odometry", "--out", tmp_path / "report")
     assert flown[0].injection == "odometry"
+
+
+def test_a_missing_autopilot_is_told_before_a_world_is_generated(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "prepare", lambda *_: 1 / 0)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("ARDUPILOT_HOME", raising=False)
+    with pytest.raises(ArduPilotNotFoundError):
+        _run("demo", "--fc", "ardupilot", "--out", tmp_path / "report")

@@ -19,7 +19,7 @@ from companion.flight.recorder import ESTIMATE_COLUMNS
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
-from localizer.geometry.posefile import (
+from localizer.geometry.trajectory import (
     PoseRow,
     read_poses,
     world_from_camera,

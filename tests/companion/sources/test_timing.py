@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
 from companion.sources.timing import (
+    UUID,
     ExposureClock,
     MinimumLag,
+    MispTime,
     Timing,
+    parse_message,
+    sei_nal,
     system_minus_monotonic,
 )
 

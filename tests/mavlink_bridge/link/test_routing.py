@@ -27,8 +27,13 @@ from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
+from sitl.vehicles.launch import (
+    GIMBAL,
+    ArduPilotSitl,
+    EmbeddedSitl,
+    find_arducopter,
+    vision_only_parameters,
+)
 
 PROMISED = (
     "CAMERA_TRACKING_GEO_STATUS",

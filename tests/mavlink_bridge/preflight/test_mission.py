@@ -10,13 +10,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError, MissionError
-from mavlink_bridge.preflight.mission import download_mission
+from mavlink_bridge.preflight.client import download_mission
 from mavlink_bridge.vehicle.mission import MissionWaypoint
 from sitl.geodesy import Location
-from sitl.ground.mission_steps import MissionStep, takeoff_step, waypoint_step
+from sitl.ground.mission_client import MissionStep, takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot
-from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import EmbeddedSitl
+from sitl.vehicles.launch import ArduPilotSitl, EmbeddedSitl, find_arducopter
 
 HOME = Location(47.397742, 8.545594, 488.0)
 RELATIVE = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
@@ -114,7 +113,7 @@ def test_places_of_the_mission(with_mission: Callable[..., Any], monkeypatch) ->
 )
 def test_refusal_and_silence_are_named(with_mission, monkeypatch, how, why):
     monkeypatch.setattr(
-        "mavlink_bridge.preflight.mission._ANSWER_S", 0.1 if "silent" in how else 30.0
+        "mavlink_bridge.preflight.client._ITEM_ANSWER_S", 0.1 if "silent" in how else 30.0
     )
     vehicle = with_mission(**how)
     with pytest.raises(MissionError, match=rf"number of items .*{why}"):
@@ -129,7 +128,7 @@ def test_a_place_that_is_not_on_earth_is_named(with_mission, monkeypatch):
 
 
 def test_a_mission_that_never_ends_is_given_up(with_mission, monkeypatch):
-    monkeypatch.setattr("mavlink_bridge.preflight.mission._LONGEST_S", -1.0)
+    monkeypatch.setattr("mavlink_bridge.preflight.client._LONGEST_S", -1.0)
     vehicle = with_mission()
     with pytest.raises(MissionError, match="gave 0 of 6 items"):
         download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))

@@ -23,7 +23,7 @@ from mavlink_bridge.link.link import sleep_until
 from sitl.suite import runner
 from sitl.suite.case import load_cases
 from sitl.suite.runner import ReportRow, run_case, run_suite
-from sitl.vehicles.ardupilot import find_arducopter
+from sitl.vehicles.launch import find_arducopter
 from sitl.vehicles.process import VehicleKind
 
 CASES = load_cases()
