@@ -31,13 +31,7 @@ from sitl.ground.pilot import Pilot
 from sitl.ground.tracks import LeastLatencyClock, SampleTrack
 from sitl.vehicles import ardupilot, process
 from sitl.vehicles.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import (
-    GIMBAL,
-    SPEEDS,
-    EmbeddedSitl,
-    VehicleSetup,
-    open_vehicle,
-)
+from sitl.vehicles.launch import GIMBAL, SPEEDS, EmbeddedSitl, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleProcess, VehicleProcessError
 
 HOME = Location(47.397742, 8.545594, 488.0)
