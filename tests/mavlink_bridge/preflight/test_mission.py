@@ -15,7 +15,7 @@ from mavlink_bridge.vehicle.mission import MissionWaypoint
 from sitl.geodesy import Location
 from sitl.ground.mission_steps import MissionStep, takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot
-from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
+from sitl.vehicles.ardupilot import ArduPilotSitl
 from sitl.vehicles.launch import EmbeddedSitl
 
 HOME = Location(47.397742, 8.545594, 488.0)
@@ -166,7 +166,6 @@ def test_embedded_vehicle() -> None:
 
 
 @pytest.mark.sitl
-@pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary")
 def test_real_arducopter() -> None:
     with ArduPilotSitl(HOME) as vehicle:
         upload_and_download(vehicle)
