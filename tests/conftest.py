@@ -21,11 +21,14 @@ import pytest
 os.environ["NUMBA_NRT_STATS"] = "1"  # before numba is imported: a test counts allocations
 
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
+from localizer.map.cache.cache import TileCache
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 from sitl.errors import SimulationError
 from sitl.vehicles.ardupilot import find_arducopter
+from tests.localizer.map.conftest import write_tileset
 from tests.parts import PARTS, SHARED_FOLDER, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
@@ -92,6 +95,16 @@ def quito_map(real_data: Callable[[str], Path], shared_folder: Path) -> Path:
         if not cache.exists():
             build_cache(source, cache)
     return cache
+
+
+@pytest.fixture(scope="session")
+def terrain(shared_folder: Path) -> TileCache:
+    """The 21 tiles of `write_tileset` as a tile cache: nobody changes it, so all tests share it."""
+    folder = shared_folder / "terrain"
+    with _alone_at(folder):
+        if not (folder / "cache").exists():
+            build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
+    return TileCache.open(folder / "cache")
 
 
 @pytest.fixture(scope="session")

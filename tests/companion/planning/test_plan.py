@@ -29,11 +29,9 @@ from companion.preflight.map_pin import map_hash
 from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import Figures
 from localizer.forecast.rivals import AmbiguousPosition
-from localizer.map.building import build
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import OdometryConfig
-from tests.localizer.map.conftest import height, write_tileset
+from tests.localizer.map.conftest import height
 
 DEPLOYMENT = """
 map: {map}
@@ -45,10 +43,8 @@ GIMBAL = Aim(Mount.from_degrees(), -75.0, False)
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("map")
-    build.build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
-    return TileCache.open(folder / "cache")
+def cache(terrain):
+    return terrain
 
 
 def place(cache, east, north):
