@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 
-from companion.cli.interrupts import end_at_once
+from companion.cli.output import end_at_once
 
 
 def main() -> None:

@@ -12,8 +12,7 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from companion.errors import ConfigError
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.live.config import ConsoleConfig
-from companion.renamed_keys import with_current_keys
-from companion.settings_file import SettingsError, read_settings, validated
+from companion.settings_file import SettingsError, read_settings, validated, with_current_keys
 from companion.sources.base import SourceSettings
 from companion.sources.zoom import ZoomTable
 from companion.targets.detections import CLICKED, parse_host_port

@@ -8,11 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.posefile import pose_line, pose_row
 from localizer.geometry.trajectory import (
     COVARIANCE_COLUMNS,
     StampedPose,
     covariance_row,
+    pose_line,
+    pose_row,
     tum_line,
 )
 from localizer.types import PoseEstimate

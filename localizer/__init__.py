@@ -34,13 +34,16 @@ if TYPE_CHECKING:
     from localizer.geometry.camera import Camera
     from localizer.geometry.geo import Geodetic, LocalFrame
     from localizer.geometry.pose import Pose
-    from localizer.geometry.posefile import PoseRow, pose_row, read_poses, write_poses
-    from localizer.geometry.posefile import world_from_camera as pose_of_row
     from localizer.geometry.trajectory import (
+        PoseRow,
         StampedPose,
+        pose_row,
+        read_poses,
         read_tum,
+        write_poses,
         write_tum,
     )
+    from localizer.geometry.trajectory import world_from_camera as pose_of_row
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
     from localizer.map.inspection.kind import map_kind
@@ -70,11 +73,11 @@ _HOMES = {
     "PoseEstimate": "localizer.types",
     "RegistrationStatus": "localizer.types",
     "TrackingState": "localizer.types",
-    "PoseRow": "localizer.geometry.posefile",
-    "pose_of_row": "localizer.geometry.posefile:world_from_camera",
-    "pose_row": "localizer.geometry.posefile",
-    "read_poses": "localizer.geometry.posefile",
-    "write_poses": "localizer.geometry.posefile",
+    "PoseRow": "localizer.geometry.trajectory",
+    "pose_of_row": "localizer.geometry.trajectory:world_from_camera",
+    "pose_row": "localizer.geometry.trajectory",
+    "read_poses": "localizer.geometry.trajectory",
+    "write_poses": "localizer.geometry.trajectory",
     "StampedPose": "localizer.geometry.trajectory",
     "read_tum": "localizer.geometry.trajectory",
     "write_tum": "localizer.geometry.trajectory",

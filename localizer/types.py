@@ -142,7 +142,7 @@ class GroundUncertainty:
     """Uncertainty of the ground height that odometry assumes, 1 sigma.
 
     grade: growth of the height error, m per metre of distance from known ground
-    (`localizer.map.relief`); the default is that of hills. missing_m: mean height of objects that
+    (`localizer.map.terrain`); the default is that of hills. missing_m: mean height of objects that
     the map lacks. model_m: a terrain model's own error: Copernicus states 2 m between neighbouring
     places in 90 % of cases.
     """

@@ -12,13 +12,12 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
 from mavlink_bridge.camera.look_at import LookAt
-from mavlink_bridge.components import COMMANDS_IN, Components
+from mavlink_bridge.components import COMMANDS_IN, Components, GroundEnd
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, message_id
-from mavlink_bridge.ground import GroundEnd
-from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.injection_enable import InjectionEnable
+from mavlink_bridge.injection.outcome import LoopVerdict
 from mavlink_bridge.injection.restart_memory import InjectionEnableMemory
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
@@ -40,11 +39,10 @@ from mavlink_bridge.messages import (
     VisionFix,
 )
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.status import OperatorStatus, named_values
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import OperatorStatus, StatusNotifier, named_values
 from mavlink_bridge.vehicle.mission import MissionWaypoint
-from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+from mavlink_bridge.vehicle_events import VehicleWatch
 
 _GROUND_WANTED = frozenset(message_id(name) for name in ("HEARTBEAT", *COMMANDS_IN))
 _WARNING = 4  # MAV_SEVERITY; lower is worse

@@ -1,4 +1,4 @@
-"""Our components on a link: heartbeats, received commands, and camera messages."""
+"""Our components on a link: heartbeats, received commands, camera messages; and the ground link."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.alerts.words import SenderRefusal
+from mavlink_bridge.alerts.words import Name, SenderRefusal
 from mavlink_bridge.camera.component import TRACKING, CameraComponent
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.injection.injection_enable import COMMANDS
@@ -26,6 +26,7 @@ from mavlink_bridge.messages import (
 )
 from mavlink_bridge.place_hint import PLACE_HINT, place_hint
 from mavlink_bridge.shared import Shared
+from mavlink_bridge.status import StatusNotifier
 
 COMMANDS_IN = ("COMMAND_LONG", "COMMAND_INT")
 _QUEUE = 64
@@ -185,3 +186,44 @@ class Components:
             self._hints_told[news.id] = time_ns
             self._shared.report(news)
         return int(mavlink.MAV_RESULT_ACCEPTED if taken else mavlink.MAV_RESULT_DENIED)
+
+
+_TICK_NS = 20_000_000
+
+
+class GroundEnd:
+    """Handles the ground link, in its thread; other threads only fill its components' queues."""
+
+    def __init__(self, shared: Shared) -> None:
+        self.components = Components(shared, ground=True)
+        self._shared = shared
+        self._notifier = StatusNotifier(shared.report)
+
+    def on_open(self, link: Link) -> None:
+        """Announce our components at once."""
+        self.components.announce()
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """Process commands; a heartbeat of one of `ground_systems` selects the link's peer."""
+        if message.get_type() == "HEARTBEAT":
+            if message.get_srcSystem() in self._shared.config.ground_systems:
+                link.keep_peer()
+            return
+        if message.get_type() in COMMANDS_IN:
+            self.components.command(link, message, time_ns)
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Send heartbeats and targets once the system id is known; returns the next time, ns."""
+        config = self._shared.config
+        state = self._shared.tracker.snapshot(now_ns)
+        link.system_id = config.system_id or state.system_id or 0
+        self._shared.watch.check(state)
+        if link.stranger:
+            self._notifier.notify_each(
+                "foreign", alert(AlertId.SENDER_IGNORED, sender=Name(link.stranger))
+            )
+        if link.system_id:
+            self.components.heartbeat(link, now_ns)
+            if config.camera.announce:
+                self.components.serve_camera(link, state, now_ns)
+        return now_ns + _TICK_NS

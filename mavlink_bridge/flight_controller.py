@@ -14,17 +14,15 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import WITHOUT_SOURCE_SET, Mode
-from mavlink_bridge.injection.fix_sender import FixSender
-from mavlink_bridge.injection.fix_warnings import FixWarnings
-from mavlink_bridge.injection.interlock import ShadowInterlock
+from mavlink_bridge.injection.fix_sender import FixSender, FixWarnings
 from mavlink_bridge.injection.outcome import InjectionOutcome
-from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.injection.shadow import ShadowInterlock, ShadowScore
 from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Figures, VehicleState
 from mavlink_bridge.place_hint import PLACE_HINT
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander, is_accepted
 from mavlink_bridge.vehicle.mission import MISSION_IN, MissionWatch
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange

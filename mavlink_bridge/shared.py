@@ -12,8 +12,8 @@ from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.messages import HealthLevel, PlaceHint, TrackRequest
-from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+from mavlink_bridge.vehicle_events import VehicleWatch
 
 CLICKED = range(1, 1001)
 """Numbers of clicked targets. What a detector sees has those behind, up to `FURTHER_CLICKS`."""

@@ -8,6 +8,9 @@ import shlex
 import shutil
 import signal
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,18 +19,17 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from companion.errors import CompanionError, ReportError
 from companion.reporting.report import write_page
-from companion.terminal.links import file_link
-from companion.terminal.steps import show_steps
+from companion.terminal.steps import file_link, show_steps
 from companion.writing import result_file, write_result
 from localizer.errors import LocalizerError
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
 from sitl.demo.flight import DemoRecord, FlightObservers, fly
 from sitl.demo.kinematic import record_scenario
-from sitl.demo.progress import LogProgress, shown_progress
 from sitl.demo.report import make_report, print_report
 from sitl.demo.scenario import (
     Condition,
@@ -45,13 +47,50 @@ from sitl.operator.follow_run import fly_follows
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
-from sitl.suite.loop.report import as_data, markdown, print_loop_row, read_rows
+from sitl.suite.loop.evaluation import as_data, markdown, print_loop_row, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
-from sitl.suite.report import markdown as suite_table
-from sitl.suite.report import print_row, write_report
-from sitl.suite.runner import run_suite
+from sitl.suite.runner import markdown as suite_table
+from sitl.suite.runner import print_row, run_suite, write_report
 from sitl.vehicles.launch import open_vehicle
 from sitl.vehicles.process import VehicleKind
+
+LINE_EVERY_S = 10.0
+
+
+class LogProgress:
+    """Prints a line when the phase changes, and every ten seconds."""
+
+    def __init__(self, console: Console) -> None:
+        self._console, self._begun = console, time.monotonic()
+        self._printed_s = 0.0
+        self._phase: str | None = None
+
+    def __call__(self, phase: str, share: float) -> None:
+        """Report a phase; share: how much of the whole work is done, 0 to 1."""
+        now_s = time.monotonic() - self._begun
+        if phase == self._phase and now_s - self._printed_s < LINE_EVERY_S:
+            return
+        self._phase, self._printed_s = phase, now_s
+        self._console.print(f"{now_s:4.0f} s {100 * share:3.0f} % {phase}", highlight=False)
+
+
+@contextmanager
+def shown_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
+    """Context manager: yields a callback (phase, share done from 0 to 1) that shows progress on
+    `console`: a bar in a terminal, otherwise lines.
+    """
+    if not console.is_terminal:
+        yield LogProgress(console)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("", total=1.0, visible=False)  # until there is something to tell
+
+        def show(phase: str, share: float) -> None:
+            bar.update(task, description=phase, completed=share, visible=True)
+
+        yield show
+
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (

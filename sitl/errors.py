@@ -17,3 +17,15 @@ class FlightError(SimulationError):
 
 class PilotError(SimulationError):
     """The vehicle refused, or did not do in time, what the pilot asked."""
+
+
+class VehicleError(Exception):
+    """Base of every error that the embedded vehicle raises on purpose."""
+
+
+class ParameterFileError(VehicleError):
+    """A parameter file that cannot be read; names file and line."""
+
+
+class PortError(VehicleError):
+    """A TCP port that cannot be listened on."""

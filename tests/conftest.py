@@ -30,7 +30,7 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 from sitl.errors import SimulationError
-from sitl.vehicles.ardupilot import find_arducopter
+from sitl.vehicles.launch import find_arducopter
 from tests.localizer.map.conftest import write_tileset
 from tests.parts import PARTS, SHARED_FOLDER, part_of
 

@@ -25,9 +25,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler
 from localizer.map.cache.cache import TileCache
 from localizer.synth.appearance.model import sample_appearance
-from sitl.camera.gimbal_error import GimbalError
+from sitl.camera.movers import traffic
+from sitl.camera.pose_sender import GimbalError
 from sitl.camera.realism import CameraRealism
-from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
 from sitl.demo.flight import home_of
 from sitl.demo.scenario import CameraSpec

@@ -17,7 +17,7 @@ from companion.calibrate.proposal import apply_changes, blind_spots, setting_cha
 from companion.config import CompanionConfig, load_config
 from companion.offline.record import load_record
 from localizer.geometry.pose import Array, euler_from_matrix, so3_log
-from sitl.camera.gimbal_error import GimbalError
+from sitl.camera.pose_sender import GimbalError
 from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import CameraSpec
 

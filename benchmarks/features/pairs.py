@@ -16,7 +16,7 @@ from localizer.geometry.pose import Pose
 from localizer.synth.appearance.model import CONDITIONS, weathered
 from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
 from localizer.training.data.shards import read_shard, shard_path, write_shards
-from localizer.training.places.photos import PhotoLibrary
+from localizer.training.places.land import PhotoLibrary
 from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose

@@ -27,9 +27,9 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, weathered
-from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, with_new_texture
+from localizer.synth.visits.visit import coarser, draw_texel, hard_surfaces, with_new_texture
 from localizer.training.data.pairs import SEASON, look_at, moved
-from localizer.training.places.changes import season_shift
+from localizer.training.places.objects import season_shift
 from localizer.types import Float32, Image, RenderedView
 
 PHOTO, COARSE_MAP, OLDER_MAP = "photo", "photo, coarser map", "photo, older map"

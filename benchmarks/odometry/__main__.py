@@ -35,7 +35,7 @@ from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
-from localizer.map.relief import ground_uncertainty
+from localizer.map.terrain import ground_uncertainty
 from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer

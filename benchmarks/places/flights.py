@@ -22,14 +22,12 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import sample_appearance
+from sitl.camera.movers import traffic
 from sitl.camera.realism import CameraClock
-from sitl.camera.traffic import traffic
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
-from sitl.demo.budget import draw_errors
-from sitl.demo.kinematic import camera_path
-from sitl.demo.scenario import Scenario, ScenarioLeg
-from sitl.demo.sequence import record_sequence
+from sitl.demo.kinematic import camera_path, record_sequence
+from sitl.demo.scenario import Scenario, ScenarioLeg, draw_errors
 
 CONDITIONS = ("day", "dusk", "night", "fog", "rain/snow", "season")
 HEIGHTS = ("low", "high")

@@ -21,7 +21,7 @@ from benchmarks.places.rivals import MISSING, OURS, RIVALS
 from benchmarks.places.run import PRIOR, PlacesPlan
 from benchmarks.places.worlds import PLACES
 from localizer.errors import SequenceError
-from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
+from localizer.evaluation.sequences import LocalizationMetrics, localization_metrics
 from localizer.geometry.pose import Array
 
 _DRAWS = 1000

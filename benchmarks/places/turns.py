@@ -12,7 +12,7 @@ import numpy as np
 
 from companion.geometry import GIMBAL_FROM_CAMERA, GimbalAngles
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
-from sitl.camera.gimbal_error import GimbalError
+from sitl.camera.pose_sender import GimbalError
 
 _NOISE_RAD = 7e-4  # of a report, per axis, one sigma
 _LATE_S = 0.01  # of all reports of a sequence alike, one sigma

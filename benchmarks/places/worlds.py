@@ -13,8 +13,7 @@ from pathlib import Path
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.synth.config import Character, WorldConfig
-from localizer.synth.visits.changes import Changes
-from localizer.synth.visits.visit import Visit, draw_look, survey_and_flight_visits
+from localizer.synth.visits.visit import Changes, Visit, draw_look, survey_and_flight_visits
 from localizer.synth.world import WorldInfo, build_visits
 
 WORLD_M = 400.0

@@ -10,7 +10,7 @@ Legs of 80 m are drawn over a world, some look over its edges: 30 to 260 m high,
 down to 35 degrees below the horizon, in every condition. Of each, `localizer.forecast` sees the map
 and the name of the condition; then six pictures of the other visit under that condition's weather
 are registered from drawn priors. A leg failed where more than a fifth of its pictures were refused
-or ended more than 1 m off. The constants of `localizer/forecast/risk.py` are fitted on the set
+or ended more than 1 m off. The constants of `localizer/forecast/forecast.py` are fitted on the set
 "tuning"; the report is of "held-out", whose worlds had no part in them.
 """
 
@@ -26,7 +26,7 @@ from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.planning.report import COLUMNS, fitted, rows_of, summary
 from benchmarks.planning.run import FlownLeg, read, run_world
-from localizer.forecast.risk import RISK_LIMIT, SIGMA
+from localizer.forecast.forecast import RISK_LIMIT, SIGMA
 from localizer.synth.config import Character
 from sitl.demo.assets import prepare
 

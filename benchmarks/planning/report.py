@@ -13,7 +13,7 @@ from scipy.stats import rankdata, spearmanr
 
 from benchmarks.planning.legs import FORECASTS, PICTURES
 from benchmarks.planning.run import FlownLeg, RegisteredFrame
-from localizer.forecast.risk import (
+from localizer.forecast.forecast import (
     RIGHT_M,
     RISK_LIMIT,
     WEIGHTS,

@@ -18,11 +18,12 @@ from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.forecast.forecast import (
     LEAST_MAP,
+    WORST_M,
+    Figures,
     Forecaster,
     draw_prior,
     position_sigma_m,
 )
-from localizer.forecast.risk import WORST_M, Figures
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer

@@ -18,7 +18,7 @@ from companion.integrity_monitor.config import ProtectionConfig
 from companion.integrity_monitor.protection import budget
 from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
-from localizer.evaluation.drawn_sensors import DrawnSensors
+from localizer.evaluation.places import DrawnSensors
 from localizer.evaluation.sequences import Sequence as Recorded
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.map.cache.cache import TileCache

@@ -20,7 +20,7 @@ from benchmarks.common.maps import build_map, origin_of, write_raster
 from benchmarks.features.real import plot_dates, unseen_plots
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.pictures import read_rgb

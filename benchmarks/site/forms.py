@@ -14,7 +14,7 @@ from typing import Any
 from benchmarks.site.kept import PrintedTable
 from companion.errors import ReportError
 from sitl.demo.scenario import ScenarioError
-from sitl.suite.loop.report import markdown, read_rows
+from sitl.suite.loop.evaluation import markdown, read_rows
 
 _FLIGHT = (
     "flight", "localizer median / p95 / max, m", "R@1 / 3 / 5, %", "complete, %",

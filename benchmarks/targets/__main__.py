@@ -30,10 +30,10 @@ from benchmarks.targets.flights import (
 from benchmarks.targets.report import FixSample, rows
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from localizer.targets.track import TargetSettings, TargetTrack
 from localizer.types import TargetFix
-from sitl.camera.traffic import traffic
+from sitl.camera.movers import traffic
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import camera_path
 from sitl.demo.scenario import load_scenario

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from companion.preflight.bench import resident_mib
+from companion.preflight.self_test import resident_mib
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Perturbation
 from localizer.evaluation.sequences import Sequence as Recorded

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.throughput.engine import engine_run
-from companion.preflight.stages import StageTime, stage_times
+from companion.preflight.self_test import StageTime, stage_times
 from companion.recorded.sequence import load_sequence
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError

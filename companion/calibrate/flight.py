@@ -23,8 +23,8 @@ from companion.calibrate.solve import Solution, solve
 from companion.config import CompanionConfig
 from companion.errors import RecordError, StreamDecodeError
 from companion.geometry import Mount
-from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import FlightRecord
+from companion.offline.replay import RecordedAutopilot
 from companion.recorded.flight import RecordedFrame
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor

@@ -12,13 +12,12 @@ import numpy as np
 import yaml
 
 from companion.calibrate import unknowns as u
+from companion.calibrate.board import LensEstimate
 from companion.calibrate.evidence import changed_camera
 from companion.calibrate.flight import CalibrationResult
-from companion.calibrate.lens import LensEstimate
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
-from companion.renamed_keys import with_current_keys
-from companion.settings_file import read_settings, validated
+from companion.settings_file import read_settings, validated, with_current_keys
 from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
 from localizer.plain_files import plain_text
 from mavlink_bridge.atomic_file import replace_file

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration_watch.attitude_filter import AXES, AttitudeFilter
 from companion.calibration_watch.observation import (
     AutopilotObservation,
     CalibrationEstimate,
     CalibrationObservation,
 )
-from companion.calibration_watch.position_filter import PositionFilter
+from companion.calibration_watch.position_filter import AXES, AttitudeFilter, PositionFilter
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.inertial import InertialDisplacement, InertialTrack
 from localizer.geometry.pose import matrix_from_quaternion, so3_log

@@ -23,8 +23,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from companion.cli.interrupts import INTERRUPTED, end_at_once
-from companion.cli.output import tell
+from companion.cli.output import INTERRUPTED, end_at_once, tell
 from companion.errors import CompanionError, ConfigError
 from companion.versions import versions
 from localizer.errors import LocalizerError

@@ -45,10 +45,10 @@ def console_command(
     if lifeline:
         threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()
     require_extra()
-    from companion.console.flight_source import FlightSource
     from companion.console.records import Records
     from companion.console.security import read_token
     from companion.console.server import ConsoleSite
+    from companion.console.source import FlightSource
     from companion.live.protocol import socket_path
 
     record = None if settings.record is None else settings.record.folder

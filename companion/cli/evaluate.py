@@ -23,18 +23,16 @@ from companion.errors import ConfigError
 from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import sequence_of
 from companion.reporting.report import write_page
-from companion.terminal.links import file_link
-from companion.terminal.steps import COMPILES, show_count, tally
+from companion.terminal.steps import COMPILES, file_link, show_count, tally
 from companion.trajectory import to_stamped_pose, write_trajectory
 from companion.versions import made_by
 from companion.writing import make_folder, refuse_input, writing
 from localizer.config import LocalizerConfig
-from localizer.evaluation.drawn_sensors import DrawnSensors
-from localizer.evaluation.metrics import LocalizationMetrics
-from localizer.evaluation.places import PlaceFinder, SimulatedPlaceData
+from localizer.evaluation.places import DrawnSensors, PlaceFinder, SimulatedPlaceData
 from localizer.evaluation.sequences import (
     CSV_COLUMNS,
     EvaluatedFrame,
+    LocalizationMetrics,
     Perturbation,
     PriorMode,
     Sequence,

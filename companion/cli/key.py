@@ -37,7 +37,7 @@ def key_command(
     elif install is None:
         raise ConfigError(f"{file}: is there already and not overwritten; give another name")
     if install is not None:
-        from mavlink_bridge.preflight.signing_setup import install_key
+        from mavlink_bridge.preflight.client import install_key
 
         tell("the key goes over this connection in clear: use a cable")
         with show_work(Console(stderr=True), f"waiting for the flight controller at {install}"):

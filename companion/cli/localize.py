@@ -35,7 +35,7 @@ from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
+from localizer.geometry.trajectory import PoseRow, read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.opening import open_localizer
 from localizer.types import PoseEstimate

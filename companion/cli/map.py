@@ -221,8 +221,7 @@ def info(
     from localizer.geometry.antimeridian import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
-    from localizer.map.inspection.footprint import as_geojson, as_kml
-    from localizer.map.inspection.inspect import levels
+    from localizer.map.inspection.inspect import as_geojson, as_kml, levels
     from localizer.map.inspection.kind import map_kind
     from localizer.map.kind import HEIGHTS_HOLD
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 
 from rich.box import SIMPLE_HEAD
@@ -9,6 +10,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
+
+INTERRUPTED = 130  # the shell's convention: 128 + SIGINT
+
+
+def end_at_once(*_: object) -> None:
+    """Signal handler that exits at once. An exception could be raised inside an import, a
+    destructor or a compiler callback, which may catch it and continue.
+    """
+    os._exit(INTERRUPTED)
 
 
 def tell(text: str | Text, style: str | None = None, *, err: bool = False) -> None:

@@ -11,8 +11,7 @@ from rich.text import Text
 
 from companion.cli.output import tell
 from companion.errors import ReportError
-from companion.terminal.links import file_link
-from companion.terminal.steps import show_steps
+from companion.terminal.steps import file_link, show_steps
 from companion.writing import result_file
 
 

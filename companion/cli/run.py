@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.interrupts import end_at_once
+from companion.cli.output import end_at_once
 from companion.config import CompanionConfig
-from companion.supervision.kept_settings import keep_settings, settings_of
+from companion.supervision.restart import keep_settings, settings_of
 from companion.terminal.console_log import console_log
 from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice
@@ -88,8 +88,7 @@ def run_command(
 
 def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     """Run the supervisor; returns the exit code of the last flight process."""
-    from companion.supervision.processes import FlightProcess
-    from companion.supervision.service_manager import ServiceManager
+    from companion.supervision.processes import FlightProcess, ServiceManager
     from companion.supervision.supervisor import Supervisor, mark_dead
     from mavlink_bridge.vehicle.crash_notifier import report_without_bridge
 

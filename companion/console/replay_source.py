@@ -7,17 +7,166 @@ and GNSS receiver come from the .tlog.
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from companion.console.kept_pictures import KeptPictures
-from companion.console.record_rows import ABSURD, estimate_of, last_row, target_of
 from companion.console.source import ConsoleSource, sample_of
+from companion.errors import StreamDecodeError
 from companion.live.protocol import Message
-from companion.offline.record import RecordTables
+from companion.live.shown import pose_data
+from companion.offline.record import Columns, RecordTables, is_time_ns, poses
 from companion.reporting.pictures import MapPictures
 from companion.reporting.record import AutopilotTracks, TimedTrack, read_autopilot
+from companion.sources.folder_source import read_image
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+
+ABSURD = 1e12  # no measurement
+_TARGET_NUMBERS = (
+    "latitude_deg", "longitude_deg", "height_m", "cov_ee", "cov_en", "cov_nn",
+    "sigma_horizontal_m", "sigma_up_m", "elsewhere",
+)  # fmt: skip
+
+
+def last_row(columns: Columns, name: str, now_ns: int) -> int | None:
+    """Index of the last row whose column `name` is at or before now_ns; None without one."""
+    if not columns:
+        return None
+    row = int(np.searchsorted(columns[name], now_ns, side="right")) - 1
+    return row if row >= 0 else None
+
+
+def estimate_of(columns: Columns, row: int) -> dict[str, Any]:
+    """One row of the estimates as JSON data; NaN becomes None."""
+
+    def number(name: str) -> float | None:
+        value = float(columns[name][row]) if name in columns else float("nan")
+        return value if abs(value) < ABSURD else None  # false for NaN, too
+
+    east, north = (number(f"sigma_{axis}_m") or 0.0 for axis in ("east", "north"))
+    return {
+        "time_ns": int(columns["exposure_time_ns"][row]),
+        "latitude_deg": number("latitude_deg"),
+        "longitude_deg": number("longitude_deg"),
+        "height_m": number("height_m"),
+        "heading_deg": _heading_deg(columns, row),
+        "covariance_m2": [[east**2, 0.0], [0.0, north**2]],
+        "sigma_m": max(east, north),
+        "state": str(columns["state"][row]),
+        "accepted": bool(columns["accepted"][row] > 0),
+        "last_fix_ns": _last_fix_ns(columns, row),
+        "quality": number("quality"),
+        "hpl_m": number("hpl_m"),
+        "stages_ms": {
+            name: number(f"{name}_ms") for name in ("reference", "extract", "register", "latency")
+        },
+    }
+
+
+def _last_fix_ns(columns: Columns, row: int) -> int | None:
+    accepted = np.flatnonzero(np.asarray(columns["accepted"][: row + 1]) > 0)
+    return int(columns["exposure_time_ns"][accepted[-1]]) if len(accepted) else None
+
+
+def _heading_deg(columns: Columns, row: int) -> float | None:
+    """Direction of the image's top or of the camera's axis, whichever is flatter."""
+    w, x, y, z = (float(columns[k][row]) for k in ("qw", "qx", "qy", "qz"))
+    forward = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    up = (-2 * (x * y - w * z), -(1 - 2 * (x * x + z * z)))
+    ahead = forward[:2] if abs(forward[2]) < 0.98 else up
+    heading = float(np.degrees(np.arctan2(ahead[0], ahead[1])) % 360.0)
+    return heading if np.isfinite(heading) else None
+
+
+def target_of(columns: Columns, name: str, row: int) -> dict[str, Any] | None:
+    """One row of a target as JSON data; None if a number is missing."""
+    numbers = {key: float(columns[key][row]) for key in _TARGET_NUMBERS if key in columns}
+    if len(numbers) < len(_TARGET_NUMBERS) or not all(map(np.isfinite, numbers.values())):
+        return None
+    ee, en, nn = (numbers.pop(key) for key in ("cov_ee", "cov_en", "cov_nn"))
+    return {
+        "name": name,
+        "time_ns": int(columns["exposure_time_ns"][row]),
+        "sigma_m": numbers.pop("sigma_horizontal_m"),
+        **numbers,
+        "amsl_m": None,
+        "covariance_m2": [[ee, en], [en, nn]],
+        "pixel": _pixel(columns, row),
+    }
+
+
+def _pixel(columns: Columns, row: int) -> list[float] | None:
+    """Pixel of the target in its frame; None if it was not seen."""
+    pixel = [float(columns[k][row]) for k in ("u", "v") if k in columns]
+    return pixel if len(pixel) == 2 and all(abs(x) < ABSURD for x in pixel) else None
+
+
+class KeptPictures:
+    """Returns each recorded frame once, at its time, with the map's view. pictures: renderer of the
+    map, None: without map view.
+    """
+
+    def __init__(self, tables: RecordTables, pictures: MapPictures | None) -> None:
+        self._tables, self._map = tables, pictures
+        paths = (tables.folder / "snapshots").glob("*.jpg")
+        self._kept = sorted((int(p.stem), p) for p in paths if is_time_ns(p.stem))
+        self._shown: int | None = None
+
+    def newest(self, now_ns: int) -> Message | None:
+        """The newest frame up to a time, with the estimate of its exposure; None if there is none,
+        it was returned by the call before, or it cannot be used. Renders, which takes a while.
+        """
+        camera = self._tables.camera
+        known = [p for p in self._kept if p[0] <= now_ns]
+        if not known or camera is None or known[-1][0] == self._shown:
+            return None
+        self._shown, path = known[-1]
+        return self._picture(path, camera)
+
+    def _picture(self, path: Path, camera: Camera) -> Message | None:
+        time_ns = int(path.stem)
+        try:
+            rgb = read_image(path)
+        except (StreamDecodeError, OSError):  # power may have gone while it was written
+            return None
+        if rgb.shape[:2] != (camera.height, camera.width):
+            return None
+        head: dict[str, Any] = {
+            "kind": "frame", "exposure_ns": time_ns, "recorded": True, "camera": camera.to_dict(),
+            "image": [camera.width, camera.height], "estimate": None, "view": None,
+        }  # fmt: skip
+        parts = [rgb.tobytes()]
+        row = last_row(self._tables.estimates, "exposure_time_ns", time_ns)
+        if row is not None and self._tables.estimates["exposure_time_ns"][row] == time_ns:
+            pose = _pose_of(self._tables.estimates, row)
+            if pose is not None:
+                estimate = estimate_of(self._tables.estimates, row)
+                head["estimate"] = estimate | {"pose": pose_data(pose)}
+                parts += self._seen_from(pose, camera, head) if estimate["accepted"] else []
+        return Message(head, b"".join(parts))
+
+    def _seen_from(self, pose: Pose, camera: Camera, head: dict[str, Any]) -> list[bytes]:
+        """The map's colours and depth at that pose; [] without the map."""
+        if self._map is None or self._map.renderer is None:
+            return []
+        target = camera.without_distortion()
+        view = self._map.renderer.render(pose, target, wait=True)
+        head["view"] = {"camera": target.to_dict(), "pose": pose_data(pose)}
+        return [view.rgb.tobytes(), view.depth.tobytes()]
+
+
+def _pose_of(columns: Columns, row: int) -> Pose | None:
+    """Pose world_from_camera of a row; None if a number is missing."""
+    names = ("east_m", "north_m", "up_m", "qw", "qx", "qy", "qz")
+    values = {name: np.asarray(columns[name][row : row + 1]) for name in names if name in columns}
+    if len(values) < len(names) or not all(abs(v[0]) < ABSURD for v in values.values()):
+        return None
+    if sum(float(values[f"q{x}"][0]) ** 2 for x in "wxyz") < 0.5:
+        return None  # no rotation
+    return poses(values)[0]
+
 
 _STEP_S = 0.5
 _PLOTTED = 600  # seconds before a place of the time bar that plots and tracks begin with

@@ -10,8 +10,10 @@ import json
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -21,16 +23,60 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from companion.console import deployment, exports
-from companion.console.examination import Examination
-from companion.console.pictures import WIDTHS_PX, page_message
+from companion.console import deployment
+from companion.console.deployment import Examination
+from companion.console.pictures import WIDTHS_PX, TileName, TopTiles, page_message
 from companion.console.records import Records, archive
 from companion.console.security import REPORT_POLICY, RequestGuard
 from companion.console.source import ConsoleSource, sample_of
-from companion.console.tiles import TileName, TopTiles
 from companion.errors import CompanionError
 from companion.live.config import ConsoleConfig
 from localizer.errors import LocalizerError
+
+_STALE = timedelta(seconds=30)
+
+
+def geojson(targets: list[dict[str, Any]]) -> dict[str, Any]:
+    """The targets of a state document as GeoJSON points; heights above the ellipsoid."""
+    return {
+        "type": "FeatureCollection",
+        "features": [
+            {
+                "type": "Feature",
+                "geometry": {
+                    "type": "Point",
+                    "coordinates": [t["longitude_deg"], t["latitude_deg"], t["height_m"]],
+                },
+                "properties": {
+                    k: t[k] for k in ("name", "amsl_m", "sigma_m", "sigma_up_m", "elsewhere")
+                },
+            }
+            for t in targets
+        ],
+    }
+
+
+def cursor_on_target(targets: list[dict[str, Any]], now: datetime | None = None) -> str:
+    """The targets of a state document as Cursor on Target: one event for each."""
+    now = now or datetime.now(timezone.utc)
+    root = ElementTree.Element("events")
+    for t in targets:
+        event = ElementTree.SubElement(
+            root, "event", version="2.0", uid=f"pilot-{t['name']}", type="a-u-G", how="m-r",
+            time=_time(now), start=_time(now), stale=_time(now + _STALE),
+        )  # fmt: skip
+        ElementTree.SubElement(
+            event, "point", lat=f"{t['latitude_deg']:.8f}", lon=f"{t['longitude_deg']:.8f}",
+            hae=f"{t['height_m']:.2f}", ce=f"{t['sigma_m']:.2f}", le=f"{t['sigma_up_m']:.2f}",
+        )  # fmt: skip
+        detail = ElementTree.SubElement(event, "detail")
+        ElementTree.SubElement(detail, "contact", callsign=t["name"])
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _time(when: datetime) -> str:
+    return when.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+
 
 _log = logging.getLogger(__name__)
 _STATIC = Path(__file__).parent / "static"
@@ -204,9 +250,9 @@ class Views:
         """Targets as GeoJSON or Cursor on Target."""
         found = ((self._site.source.newest.state or {}).get("targets")) or []
         if request.path_params["kind"] == "geojson":
-            text, kind = json.dumps(exports.geojson(found)), "application/geo+json"
+            text, kind = json.dumps(geojson(found)), "application/geo+json"
         else:
-            text, kind = exports.cursor_on_target(found), "application/xml"
+            text, kind = cursor_on_target(found), "application/xml"
         name = f"targets.{'geojson' if kind.endswith('json') else 'cot'}"
         return Response(text, media_type=kind, headers=_attachment(name))
 

@@ -26,14 +26,16 @@ from companion.trajectory import snapshot_name
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_quaternion, quaternion_from_matrix
-from localizer.geometry.posefile import (
+from localizer.geometry.trajectory import (
+    StampedPose,
     pose_row,
     read_poses,
+    read_tum,
     text_lines,
     world_from_camera,
     write_poses,
+    write_tum,
 )
-from localizer.geometry.trajectory import StampedPose, read_tum, write_tum
 
 AUTOPILOT_COLUMNS = (
     "name", "time_ns", "latitude_deg", "longitude_deg", "height_m",

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from companion.errors import ConfigError, RecordError, ReportError
-from companion.offline.record import RecordTables, is_time_ns, read_record
-from companion.offline.tables import Columns
+from companion.offline.record import Columns, RecordTables, is_time_ns, read_record
 from companion.writing import result_file
 from localizer.errors import LocalizerError
 from localizer.map.cache.cache import TileCache

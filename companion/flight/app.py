@@ -14,15 +14,14 @@ from contextlib import ExitStack
 from typing import Any
 
 from companion.config import CompanionConfig
-from companion.errors import CompanionError
+from companion.errors import CompanionError, redacted
 from companion.flight.channels import Feed
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly, Component
 from companion.flight.health import HealthMonitor
 from companion.flight.recorder import RecordKeeper
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
-from companion.redaction import redacted
-from companion.supervision.pulse import Pulse
+from companion.supervision.processes import Pulse
 from companion.supervision.restart import without_lost_disks
 from localizer.errors import LocalizerError
 from localizer.tracking.engine import DualThreadEngine

@@ -22,17 +22,15 @@ from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics, target_report
 from companion.errors import ConfigError
 from companion.flight.calibration_observer import CalibrationObserver
-from companion.flight.channels import Feed
+from companion.flight.channels import Feed, FixInjection, is_for_injection
 from companion.flight.components import Assembly, Component
 from companion.flight.health import HealthInputs, HealthMonitor
-from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
 from companion.flight.priors import AutopilotPose, local_near
 from companion.flight.reachable_region import ReachableRegion
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, enu_on_map
-from companion.flight.view_reporter import ViewReporter
-from companion.ground.vital_signs import VitalSigns
+from companion.ground.vital_signs import ViewReporter, VitalSigns
 from companion.inertial import InertialTrack
 from companion.integrity_monitor.checks import IntegrityLimits
 from companion.integrity_monitor.debouncer import InhibitMemory
@@ -56,7 +54,7 @@ from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.pose import matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from localizer.map.inspection.kind import map_kind
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.motion import AuxiliarySensors

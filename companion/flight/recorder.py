@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
-from companion.errors import DiskFaultError, ReportError
+from companion.errors import DiskFaultError, ReportError, redacted
 from companion.ground.target_files import write_target_files
 from companion.preflight.map_pin import readable_map_hash
-from companion.redaction import redacted
 from companion.trajectory import TrajectoryFiles, snapshot_name, to_stamped_pose
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame

@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from companion.calibration_watch.ground import GroundView
-from companion.calibration_watch.observation import CalibrationEstimate, CalibrationObservation
+from companion.calibration_watch.observation import (
+    CalibrationEstimate,
+    CalibrationObservation,
+    GroundView,
+)
 from companion.calibration_watch.watch import BORESIGHT_DEG, FOCAL_SHARE, TIME_S, CalibrationWatch
 from companion.inertial import InertialTrack
 from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.integrity_monitor.debouncer import ActiveAlerts, AlertDebouncer, CheckResult
-from companion.integrity_monitor.ekf import EkfWatch
 from companion.integrity_monitor.jump import JumpCheck
-from companion.integrity_monitor.motion import CALM_SHARE, MotionCheck, MotionVerdict
-from companion.integrity_monitor.position_checks import GnssCheck, HeightCheck
+from companion.integrity_monitor.motion import CALM_SHARE, MotionCheck, MotionVerdict, ScaleCheck
+from companion.integrity_monitor.position_checks import EkfWatch, GnssCheck, HeightCheck, TiltCheck
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
-from companion.integrity_monitor.scale import ScaleCheck
 from companion.integrity_monitor.step import StepUncertainty
-from companion.integrity_monitor.tilt import TiltCheck
 from companion.integrity_monitor.video import (
     LOW_DETAIL,
     REPEAT_S,

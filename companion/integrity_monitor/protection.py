@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.calibration_watch.ground import UNKNOWN_HEIGHT_M
+from companion.calibration_watch.observation import UNKNOWN_HEIGHT_M
 from companion.integrity_monitor.config import ProtectionConfig
 from mavlink_bridge.messages import VehicleState, VisionFix
 

@@ -1,7 +1,7 @@
 """Serves the console from the flight process over a local socket, in one thread.
 
 At most one unfinished message per console is kept; others are dropped. Frames pass through shared
-memory (`live.shared`), one at a time: the newest frame is written after the console has read the
+memory (`live.protocol`), one at a time: the newest frame is written after the console has read the
 one before. Without a console the thread sleeps.
 """
 
@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.live.orders import OrderError, Orders
-from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, encode
-from companion.live.shared import SharedMemory
+from companion.live.protocol import MOST_ORDER, LinkError, MessageDecoder, SharedMemory, encode
 from companion.live.shown import ConsoleData, ConsoleFrame
 
 _log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""Data for the console: state documents, and frames with their poses.
+"""Data for the console: state documents, load of this computer, and frames with their poses.
 
 The flight's threads only store references; the publisher's thread formats the data.
 """
@@ -6,27 +6,73 @@ The flight's threads only store references; the publisher's thread formats the d
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from companion.live.machine import MachineLoad
 from companion.targets.target_manager import TargetEstimate
 from companion.writing import json_value
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
 from mavlink_bridge.alerts.catalogue import body
-from mavlink_bridge.injection.closed_loop import LoopVerdict
+from mavlink_bridge.injection.outcome import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.mission import MissionWaypoint
+
+_ZONES = Path("/sys/class/thermal")
+_HOT_READS_S = 5.0
+
+
+class MachineLoad:
+    """Measures the load of this process and of the machine."""
+
+    def __init__(self) -> None:
+        self._before = (time.monotonic(), self._used_s())
+        self._temperature: tuple[float, float | None] = (-_HOT_READS_S, None)
+
+    def read(self) -> dict[str, float | None]:
+        """cpu_percent: of this process since the last call, 100 for one core; cores: their number;
+        load: one-minute average; temperature_c: warmest zone, degrees Celsius, None if unknown.
+        """
+        now, used = time.monotonic(), self._used_s()
+        elapsed = max(now - self._before[0], 1e-3)
+        share = 100.0 * (used - self._before[1]) / elapsed
+        self._before = (now, used)
+        if now - self._temperature[0] >= _HOT_READS_S:
+            self._temperature = (now, warmest_c())
+        return {
+            "cpu_percent": share,
+            "cores": float(os.cpu_count() or 1),
+            "load": os.getloadavg()[0],
+            "temperature_c": self._temperature[1],
+        }
+
+    @staticmethod
+    def _used_s() -> float:
+        times = os.times()
+        return times.user + times.system
+
+
+def warmest_c() -> float | None:
+    """Temperature of the warmest thermal zone, degrees Celsius; None if none can be read."""
+    found = []
+    for path in _ZONES.glob("thermal_zone*/temp"):
+        try:
+            found.append(int(path.read_text()) / 1000.0)
+        except (OSError, ValueError):
+            continue
+    return max(found, default=None)
+
 
 _FRAMES = 12  # pictures that wait for their estimate: a second or so
 _WIDEST = 960  # pixels that are sent

@@ -4,8 +4,10 @@ map is the one of a record, because it may have been built again since.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,6 @@ from pydantic import ValidationError
 from companion.config import CameraModel, CompanionConfig, parse_config
 from companion.errors import ConfigError, RecordError
 from companion.flight.recorder import MANIFEST_NAME
-from companion.offline.tables import Columns, poses, read_columns
 from companion.preflight.map_pin import map_hash
 from companion.recorded.cameras import camera_given
 from companion.recorded.flight import (
@@ -29,9 +30,49 @@ from companion.trajectory import snapshot_name
 from localizer.errors import CameraError, GeoreferenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
 from localizer.plain_files import plain_text
+
+Columns = Mapping[str, np.ndarray]
+
+
+def read_columns(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """Columns of a CSV file as float64 arrays, NaN where a field is empty; {} without a row.
+
+    Columns named in `text` are strings; columns whose name ends in ``_ns`` are int64, because
+    float64 would round them. A last row that a power loss cut short is left out. `RecordError` if
+    the file is not a table of a record; OSError or UnicodeDecodeError if it cannot be read.
+    """
+    lines = io.StringIO(plain_text(path, None), newline="").readlines()
+    if lines and not lines[-1].endswith("\n"):
+        lines.pop()
+    try:
+        rows = list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise RecordError(f"{path}: not a table of a record: {error}") from error
+    names = rows[0].keys() if rows else []
+    columns: dict[str, np.ndarray] = {}
+    try:
+        for name in names:
+            values = [row[name] for row in rows]
+            if name in text:
+                columns[name] = np.array(values)
+            elif name.endswith("_ns"):
+                columns[name] = np.array([int(v) for v in values], dtype=np.int64)
+            else:
+                columns[name] = np.array([float(v) if v else np.nan for v in values])
+    except (TypeError, ValueError, OverflowError) as error:
+        raise RecordError(f"{path}: not a table of a record: {error}") from error
+    return columns
+
+
+def poses(columns: Columns) -> list[Pose]:
+    """Rows with east_m, north_m, up_m and qw..qz as poses world_from_camera."""
+    t = np.column_stack([columns[k] for k in ("east_m", "north_m", "up_m")])
+    q = np.column_stack([columns[k] for k in ("qw", "qx", "qy", "qz")])
+    return [Pose(matrix_from_quaternion(qi), ti) for qi, ti in zip(q, t, strict=True)]
+
 
 STAGES = ("reference", "extract", "register", "latency")
 _LARGEST = 1e9

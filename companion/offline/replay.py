@@ -15,16 +15,60 @@ import numpy as np
 from companion.conversions import CameraExtrinsics
 from companion.errors import RecordError, StreamDecodeError
 from companion.flight.priors import AutopilotPose
-from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import MIN_IMAGES, FlightRecord, RecordedEstimate
-from companion.recorded.flight import RecordedFrame
-from companion.sources.zoom import with_focal_factor
+from companion.recorded.flight import LogBeside, RecordedFrame
+from companion.sources.zoom import ZoomTable, with_focal_factor
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import PoseEstimate
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.tlog import read_tlog
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+
+class RecordedAutopilot(VehicleTracker):
+    """The vehicle's telemetry from a record's messages, replayed to any later time: call `advance`
+    before each look. start_ns: messages before it, CLOCK_MONOTONIC, are left out. `TlogError` if
+    the log cannot be read.
+    """
+
+    def __init__(self, bridge: BridgeConfig, log: LogBeside, start_ns: int) -> None:
+        super().__init__(bridge)
+        self._now_ns = start_ns
+        dated = ((utc - log.ahead_ns, m) for utc, m in read_tlog(log.path))
+        # A .tlog is appended to: earlier flights may stand before this one.
+        self._messages = (item for item in dated if item[0] >= start_ns)
+        self._next = next(self._messages, None)
+
+    def advance(self, time_ns: int) -> None:
+        """Process all messages that had arrived by `time_ns`, CLOCK_MONOTONIC."""
+        self._now_ns = time_ns
+        while self._next is not None and self._next[0] <= time_ns:
+            received_ns, message = self._next
+            if self.accepts(message):
+                if message.get_type() != "TIMESYNC":
+                    self.handle(message, received_ns)
+                elif message.tc1 != 0:  # an answer; ts1 is our own time of the question
+                    self.timesync(message.tc1, message.ts1, received_ns)
+            self._next = next(self._messages, None)
+
+    def zoom_factor(self, zoom: ZoomTable | None, time_ns: int) -> float | None:
+        """Multiple of the model's focal length by the log; 1 if the camera has no zoom, None if the
+        log has no value.
+        """
+        if zoom is None:
+            return 1.0
+        level = self.zoom_at(time_ns, zoom.hold_s)
+        return None if level is None else zoom.factor(level)
+
+    def state(self) -> VehicleState:
+        """The vehicle's state at the current replay time."""
+        return self.snapshot(self._now_ns)
+
 
 _log = logging.getLogger(__name__)
 _ALIKE = 1e-3  # a share of the focal length that is no other lens

@@ -19,9 +19,9 @@ from companion.calibration_watch.map_offset import MapOffsetEstimator
 from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics
 from companion.errors import RecordError, StreamDecodeError, StreamSizeError
+from companion.flight.channels import FixInjection, is_for_injection
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly
-from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.priors import AutopilotPose
 from companion.flight.search import PlaceSearch
 from companion.inertial import InertialTrack

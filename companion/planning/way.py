@@ -24,7 +24,7 @@ from localizer.geometry.antimeridian import geo_box
 from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from mavlink_bridge.mission.gimbal import GimbalTarget, RegionOfInterest
 from mavlink_bridge.mission.items import LoiterCircle
 

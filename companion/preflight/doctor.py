@@ -1,7 +1,10 @@
-"""All checks of `companion doctor`: the bridge's, and map, model, camera, files and machine."""
+"""All checks of `companion doctor`: the bridge's, and map, model, camera, settings and machine."""
 
 from __future__ import annotations
 
+import math
+import os
+import socket
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,14 +12,16 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from companion.config import CompanionConfig
-from companion.errors import CompanionError, DetectorError
-from companion.preflight.coverage import check_mission, check_origin, check_vehicle_position
-from companion.preflight.heights import check_heights
+from companion.errors import CompanionError, DetectorError, redacted
+from companion.preflight.coverage import (
+    check_heights,
+    check_mission,
+    check_origin,
+    check_vehicle_position,
+)
 from companion.preflight.map_pin import require_pinned
-from companion.preflight.meanings import check_plausibility, check_ports
-from companion.preflight.places import check_places
-from companion.redaction import redacted
 from companion.sources import StreamState, open_source
+from companion.targets.detections import parse_host_port
 from companion.targets.detector.network import DetectorNetwork
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
@@ -26,9 +31,137 @@ from localizer.map.inspection.kind import map_kind
 from localizer.map.kind import MapKind
 from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
+from mavlink_bridge.link.signing import load_key
+from mavlink_bridge.preflight.client import download_mission
 from mavlink_bridge.preflight.doctor import Diagnosis, examine
-from mavlink_bridge.preflight.mission import download_mission
 from mavlink_bridge.preflight.rules import DoctorFinding
+
+_LONGEST_ARM_M = 2.0  # of most aircraft that carry this
+_WIDEST_DEG = 125.0  # beyond it Brown's model is no lens's
+_STEEP_ENOUGH_DEG = 10.0  # below the horizon, to see ground near by
+_SHORTEST_MS = 1.0  # less is no camera's, no link's and nobody's
+
+
+def check_plausibility(config: CompanionConfig) -> list[DoctorFinding]:
+    """Advice about unusual settings."""
+    return [*_arm(config), *_mount(config), *_lens(config), *_milliseconds(config)]
+
+
+def check_ports(config: CompanionConfig) -> list[DoctorFinding]:
+    """A finding if another program uses the port `targets.detections`; otherwise []."""
+    address = config.targets.detections
+    if address is None:
+        return []
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(parse_host_port(address))
+    except OSError as error:
+        why = f"targets.detections {address}: {error.strerror or error}: another program's?"
+        return [DoctorFinding("ports", "in use", "free ports", why, False, True)]
+    return []
+
+
+def _arm(config: CompanionConfig) -> list[DoctorFinding]:
+    arm = config.camera.lever_arm_m
+    if max(abs(part) for part in arm) <= _LONGEST_ARM_M:
+        return []
+    found = ", ".join(f"{part:g}" for part in arm) + " m"
+    why = "metres, not centimetres: forward, right, down; every position is off by what is wrong"
+    return [_odd("camera.lever_arm_m", found, f"within {_LONGEST_ARM_M:g} m", why)]
+
+
+def _mount(config: CompanionConfig) -> list[DoctorFinding]:
+    camera = config.bridge.camera
+    pitch = camera.mount_pitch_deg
+    if camera.mount != "fixed" or abs(pitch) >= _STEEP_ENOUGH_DEG:
+        return []
+    why = "a fixed camera that looks to the horizon; in degrees, not radians: -90 is straight down"
+    return [_odd("bridge.camera.mount_pitch_deg", f"{pitch:g}", "-10 to -90", why)]
+
+
+def _lens(config: CompanionConfig) -> list[DoctorFinding]:
+    model = config.camera.model
+    wide = math.degrees(2.0 * math.atan(0.5 * model.width / model.fx))
+    if wide <= _WIDEST_DEG:
+        return []
+    why = f"fx {model.fx:g} on {model.width} pixels: pixels, not millimetres, and no fisheye"
+    return [_odd("camera.model", f"{wide:.0f} degrees wide", f"<= {_WIDEST_DEG:g}", why)]
+
+
+def _milliseconds(config: CompanionConfig) -> list[DoctorFinding]:
+    told = {
+        "camera.model.readout_ms": config.camera.model.readout_ms,
+        "camera.settings.latency_ms": config.camera.settings.latency_ms,
+        "targets.operator_delay_ms": config.targets.operator_delay_ms,
+        "bridge.injection.delay_ms": config.bridge.injection.delay_ms,
+    }
+    why = "milliseconds, not seconds"
+    return [
+        _odd(name, f"{value:g}", f"0, or >= {_SHORTEST_MS:g}", why)
+        for name, value in told.items()
+        if 0.0 < value < _SHORTEST_MS
+    ]
+
+
+def _odd(name: str, found: str, needed: str, why: str) -> DoctorFinding:
+    return DoctorFinding(name, found, needed, why, False, False)
+
+
+def check_places(config: CompanionConfig) -> list[DoctorFinding]:
+    """Findings on the folders, signing keys and console files that the configuration names: a
+    flight would not start if one cannot be written or read.
+    """
+    bridge = config.bridge
+    written = {"bridge.tlog": bridge.tlog}
+    faults = []
+    if config.record is not None:
+        faults.append(_unwritable("record.folder", config.record.folder))
+    if config.state_dir is not None:
+        faults.append(_unwritable("state_dir", config.state_dir))
+    faults += [_no_file(key, path) for key, path in written.items() if path is not None]
+    keys = {"bridge.signing": bridge.signing, "bridge.ground_signing": bridge.ground_signing}
+    for key, signing in keys.items():
+        if signing is not None:
+            try:
+                load_key(signing.key_file)
+            except BridgeError as error:
+                faults.append(f"{key}: {error}")
+    if config.console is not None:
+        page = config.console
+        read = {"token_file": page.token_file, "tls_certificate": page.tls_certificate}
+        for key, path in (read | {"tls_key": page.tls_key}).items():
+            if path is not None and not path.is_file():
+                faults.append(f"console.{key} {path}: is no file")
+    needed = "folders to write to, keys to read"
+    return [
+        DoctorFinding("files", "unusable", needed, fault, False, True) for fault in faults if fault
+    ]
+
+
+def _no_file(key: str, path: Path) -> str:
+    """Why the file cannot be created or written; "" if it can."""
+    try:
+        if path.is_dir():
+            return f"{key} {path}: a folder, not a file"
+    except OSError as error:
+        return f"{key} {path}: {error.strerror}"
+    return _unwritable(key, path.parent)
+
+
+def _unwritable(key: str, folder: Path) -> str:
+    """Why the folder, or its nearest existing parent, cannot be written; "" if it can."""
+    try:
+        place = folder
+        while not place.exists() and place != place.parent:
+            place = place.parent
+        if not place.is_dir():
+            return f"{key} {folder}: {place} is not a folder"
+        if not os.access(place, os.W_OK | os.X_OK):
+            return f"{key} {folder}: {place} cannot be written"
+    except OSError as error:
+        return f"{key} {folder}: {error.strerror}"
+    return ""
+
 
 _FEED_S = 8.0  # without any picture
 _FEED_ENOUGH_S = 3.0  # of pictures: their rate is known

@@ -23,7 +23,6 @@ from companion.geometry import (
     Mount,
     camera_attitude,
 )
-from companion.recorded.dataflash import dataflash_messages
 from companion.recorded.flight import (
     Datum,
     Height,
@@ -32,8 +31,7 @@ from companion.recorded.flight import (
     Telemetry,
     Track,
 )
-from companion.recorded.log_messages import Dated
-from companion.recorded.ulog import ulog_messages
+from companion.recorded.log_messages import Dated, dataflash_messages, ulog_messages
 from localizer.geometry.pose import euler_from_matrix, matrix_from_euler, matrix_from_quaternion
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.clock import BootClock

@@ -35,8 +35,14 @@ from companion.recorded.photo_tags import (
 )
 from companion.recorded.places_file import PLACES_SUFFIXES, read_places
 from companion.recorded.sequence import is_sequence, read_sequence
-from companion.recorded.subtitles import Subtitles, read_subtitles
-from companion.recorded.video import VIDEO_SUFFIXES, VideoFacts, extract_frames, video_facts
+from companion.recorded.video import (
+    VIDEO_SUFFIXES,
+    Subtitles,
+    VideoFacts,
+    extract_frames,
+    read_subtitles,
+    video_facts,
+)
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import list_images
 from localizer.errors import CameraError

@@ -27,7 +27,7 @@ from localizer.evaluation.sequences import Sequence
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
-from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
+from localizer.geometry.trajectory import PoseRow, read_poses, world_from_camera
 from localizer.plain_files import files_of
 
 # Video that says nothing of time is taken as 30 frames per second (the paper's data sets).

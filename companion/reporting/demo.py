@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from companion.errors import RecordError
-from companion.offline.record import RecordTables, read_record
-from companion.offline.tables import Columns, poses, read_columns
+from companion.offline.record import Columns, RecordTables, poses, read_columns, read_record
 from companion.reporting import figures
 from companion.reporting.content import (
     INNER,
@@ -26,6 +25,7 @@ from companion.reporting.content import (
     Report,
     Span,
     Stanford,
+    criterion_result,
 )
 from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import (
@@ -34,7 +34,6 @@ from companion.reporting.record import (
     worst_frames,
 )
 from companion.reporting.record import uncertainty_plots as uncertainty
-from companion.reporting.verdicts import criterion_result
 from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
 

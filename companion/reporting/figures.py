@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from companion.offline.record import STAGES
-from companion.offline.tables import Columns
+from companion.offline.record import STAGES, Columns
 from companion.reporting.content import (
     NOTHING,
     Curve,

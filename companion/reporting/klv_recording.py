@@ -15,15 +15,14 @@ from companion.errors import RecordError, StreamOpenError
 from companion.klv.local_set import encode
 from companion.klv.metadata import KlvContext, frame_fields
 from companion.klv.transport import TransportWriter
-from companion.offline.record import RecordTables, read_record
-from companion.offline.tables import Columns, poses
+from companion.offline.record import Columns, RecordTables, poses, read_record
 from companion.reporting.figures import nearest
 from companion.sources.base import fitted_camera, has_times, video_stream
-from companion.sources.misp import misp_time
+from companion.sources.timing import misp_time
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, matrix_from_euler
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from localizer.types import PoseEstimate, RegistrationStatus, TargetFix, TrackingState
 from mavlink_bridge.link.tlog import read_tlog
 

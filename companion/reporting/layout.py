@@ -24,9 +24,20 @@ from companion.reporting.content import (
     ReportTable,
     Stanford,
 )
-from companion.vendored import licence_of, vendored
 from companion.writing import write_result
 from localizer.types import Image
+
+
+def vendored(name: str) -> str:
+    """The text of a file of companion/console/static/vendor."""
+    folder = resources.files("companion") / "console" / "static" / "vendor"
+    return (folder / name).read_text(encoding="utf-8")
+
+
+def licence_of(package: str) -> str:
+    """The licence in the package's files."""
+    return vendored(f"LICENSE.{package}.txt")
+
 
 _JPEG_QUALITY = 82
 _MOST_POINTS = 3000  # of a curve or track: beyond it nobody sees them

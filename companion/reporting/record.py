@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.offline.record import RecordTables, is_time_ns, mapping, read_record
-from companion.offline.tables import Columns, poses
+from companion.offline.record import Columns, RecordTables, is_time_ns, mapping, poses, read_record
 from companion.reporting import figures
 from companion.reporting.content import (
     INNER,

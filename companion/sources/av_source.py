@@ -22,8 +22,8 @@ from companion.errors import (
     StreamError,
     StreamOpenError,
     StreamSizeError,
+    redacted,
 )
-from companion.redaction import redacted
 from companion.sources.base import (
     GREY_RANGE_ADVICE,
     FrameSource,
@@ -42,10 +42,9 @@ from companion.sources.datagrams import (
     UdpAddress,
     VideoDatagrams,
 )
-from companion.sources.misp import misp_time
 from companion.sources.references import DamageTracker, ReferenceTracker
-from companion.sources.sdp import SdpSession
-from companion.sources.timing import ExposureClock
+from companion.sources.rtp import SdpSession
+from companion.sources.timing import ExposureClock, misp_time
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange, grey_levels
 from localizer.tracking.mailbox import Mailbox

@@ -1,12 +1,78 @@
-"""Flight processes, as the supervisor starts and ends them."""
+"""Flight processes, as the supervisor starts and ends them, their signs of life, and systemd.
+
+Pulse: a process whose threads hang is not dead, and its heartbeat may continue. So each thread that
+a position needs stores the time of its last cycle; the oldest is sent.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import subprocess
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
+
+from companion.ending import wait_for_end
+from mavlink_bridge.link.clock import monotonic_ns
+
+_PERIOD_S = 0.25
+
+
+class Pulse:
+    """Writes ``NAME MILLISECONDS`` lines: the component whose last cycle is oldest, and its age.
+
+    beats: times of the components' last cycles, CLOCK_MONOTONIC ns; ages count from the start at
+    the earliest. descriptor: of a pipe, closed at the end. Writing does not wait for a supervisor
+    that does not read.
+    """
+
+    def __init__(self, beats: Callable[[], Mapping[str, int]], descriptor: int) -> None:
+        self._beats, self._descriptor = beats, descriptor
+        os.set_inheritable(descriptor, False)
+        os.set_blocking(descriptor, False)
+        self._begun_ns = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._begun_ns = monotonic_ns()
+        self._thread.start()
+
+    def stop(self, *, clean_shutdown: bool) -> None:
+        """Stop the thread, announce the end and close the pipe. After a clean shutdown the
+        supervisor allows time to close a recording; after an error it restarts soon.
+        """
+        self._stop.set()
+        ended = wait_for_end(self._thread)
+        self._say(f"{ENDING if clean_shutdown else 'failing'} 0\n".encode())
+        if ended:  # else its next line would go into whatever file has the number then
+            os.close(self._descriptor)
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            turns = {name: max(at, self._begun_ns) for name, at in self._beats().items()}
+            self._say(line(turns, monotonic_ns()))
+
+    def _say(self, text: bytes) -> None:
+        try:
+            os.write(self._descriptor, text)
+        except OSError:  # full, or the supervisor is gone: the flight goes on alone
+            return
+
+
+def line(beats: Mapping[str, int], now_ns: int) -> bytes:
+    """The line of `Pulse` for now_ns, with `-` for blanks in the name; ``all 0`` without
+    components. beats: times of their last cycles, ns.
+    """
+    if not beats:
+        return b"all 0\n"
+    name = min(beats, key=lambda one: beats[one])
+    age_ms = max(now_ns - beats[name], 0) // 1_000_000
+    return f"{name.replace(' ', '-')} {age_ms}\n".encode()
+
 
 _DISMISS_S = 5.0
 _KILL_S = 10.0  # its ports are free once it is gone, and not before
@@ -108,6 +174,55 @@ class FlightProcess:
 
 
 def _beat(line: bytes) -> Beat | None:
-    """Parse a line of `companion.supervision.pulse`; None for anything else."""
+    """Parse a line of `companion.supervision.processes`; None for anything else."""
     part, _, age_ms = line.decode(errors="replace").partition(" ")
     return Beat(part, int(age_ms) * 1e-3) if age_ms.isdecimal() and len(age_ms) < 12 else None
+
+
+_VARIABLE = "NOTIFY_SOCKET"
+_LONGEST = 200  # characters of a status
+
+
+class ServiceManager:
+    """Reports to the service manager; does nothing with an empty address. Never blocks.
+
+    address: of a datagram socket, a path, or ``@`` and a name in the abstract name space.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        self._socket: socket.socket | None = None
+        if address:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            self._socket.setblocking(False)
+
+    @classmethod
+    def of(cls, environment: MutableMapping[str, str]) -> ServiceManager:
+        """From NOTIFY_SOCKET, "" if not set. It is removed from `environment`, so that child
+        processes do not use it.
+        """
+        return cls(environment.pop(_VARIABLE, ""))
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def ready(self) -> None:
+        """Report that the service has started."""
+        self._say("READY=1")
+
+    def alive(self) -> None:
+        """Report a sign of life (WatchdogSec)."""
+        self._say("WATCHDOG=1")
+
+    def status(self, text: str) -> None:
+        """Set the line for `systemctl status`, cut to 200 characters."""
+        self._say(f"STATUS={text[:_LONGEST]}")
+
+    def _say(self, text: str) -> None:
+        if self._socket is None:
+            return
+        with contextlib.suppress(OSError):  # it restarts, or its queue is full: the flight goes on
+            self._socket.sendto(text.encode(), self._address)

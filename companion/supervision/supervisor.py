@@ -21,8 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.supervision.processes import ENDING, Beat, FlightProcess
-from companion.supervision.service_manager import ServiceManager
+from companion.supervision.processes import ENDING, Beat, FlightProcess, ServiceManager
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId

@@ -1,4 +1,4 @@
-"""Shows the progress of a command: a spinner on a terminal, lines in a log."""
+"""Shows the progress of a command: a spinner on a terminal, lines in a log; links to files."""
 
 from __future__ import annotations
 
@@ -7,9 +7,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
+from rich.style import Style
+from rich.text import Text
+
+
+def file_link(path: Path) -> Text:
+    """The path as text that links to the file (OSC 8), if the terminal supports it."""
+    full = path.resolve()
+    return Text(str(path), Style(color="green", link=full.as_uri()))
+
 
 Say = Callable[[str], None]
 _SILENT_S, _COUNT_EVERY_S, _EVERY_S = 2.0, 5.0, 10.0

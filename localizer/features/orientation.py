@@ -2,7 +2,7 @@
 
 Independent of the contrast's sign and locally normalised. Seven orientation bins, and one channel
 that is large where the image is flat, so that normalisation to unit length does not amplify sensor
-noise. `localizer.training.models.orientation` has the same function in torch. Compiled, it takes a
+noise. `localizer.training.models.tiny` has the same function in torch. Compiled, it takes a
 fifth of the time that a runtime for networks takes for its many small steps.
 """
 

@@ -17,8 +17,7 @@ import yaml
 
 from localizer.errors import CameraError
 from localizer.geometry.lens import COEFFICIENTS, LensModel, whole_coefficients
-from localizer.plain_files import plain_text
-from localizer.strict_yaml import load_json, load_yaml
+from localizer.plain_files import load_json, load_yaml, plain_text
 
 KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 _MODEL_KEY = re.compile(r"(?i)(camera|lens|distortion|projection)?_?(model|type)|lens|projection")

@@ -21,7 +21,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array
 from localizer.synth.config import BLOCK_M, TOP_M, Variant, WorldConfig, look_of
 from localizer.synth.plan.layout import plan_world
-from localizer.synth.plan.plan import PlannedTarget, WorldPlan
+from localizer.synth.plan.planner import PlannedTarget, WorldPlan
 from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.tiles.bake import (
     Baker,

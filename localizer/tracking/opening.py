@@ -16,8 +16,7 @@ from localizer.integrity.probability import place_model
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import map_kind
-from localizer.map.relief import ground_uncertainty
-from localizer.map.terrain import open_terrain
+from localizer.map.terrain import ground_uncertainty, open_terrain
 from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer

@@ -18,12 +18,11 @@ from pydantic import (
 )
 
 from localizer.errors import ModelError
-from localizer.plain_files import plain_text
-from localizer.strict_yaml import load_yaml, misread_booleans
+from localizer.plain_files import load_yaml, misread_booleans, plain_text
 from localizer.synth.heightfield.scene import BLOCK
 from localizer.training.data.pairs import SceneConfig
 from localizer.training.models.networks import NetworkConfig
-from localizer.training.places.photos import PhotoLibrary
+from localizer.training.places.land import PhotoLibrary
 
 _MOST_WORKERS = 1024  # processes or threads
 _MOST_STEPS = 10**9

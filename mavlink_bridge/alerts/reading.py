@@ -4,8 +4,6 @@ For recordings (`.tlog`), the simulator's ground station and records of version 
 the flight process uses it: they have the alerts themselves.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 

@@ -16,17 +16,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.look_at import LOOKS, LookAt
 from mavlink_bridge.camera.messages import (
+    adsb_vehicle,
     camera_fov_status,
     camera_information,
-    track_request,
-    video_stream_information,
-)
-from mavlink_bridge.camera.targets import (
-    adsb_vehicle,
     image_captured,
     is_confirmed,
+    track_request,
     tracking_geo_status,
     tracking_image_status,
+    video_stream_information,
 )
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import SteadyUtc

@@ -25,7 +25,7 @@ from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.sensor_errors import VEHICLE_SENSORS

@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from mavlink_bridge.link import signing
-from mavlink_bridge.link.replay import NO_STAMP, ReplayWindow
+from mavlink_bridge.link.signing import NO_STAMP, ReplayWindow
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01

@@ -23,7 +23,7 @@ from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.link import signing
 from mavlink_bridge.link.clock import monotonic_ns, utc_us
 from mavlink_bridge.link.framing import FrameReader
-from mavlink_bridge.link.replay import ReplayWindow
+from mavlink_bridge.link.signing import ReplayWindow
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
 from mavlink_bridge.link.waking import WakePipe

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.errors import MissionError
-from mavlink_bridge.mission.effects import FLY_TOO, GIMBAL_ONLY, NO_EFFECT, VIEW
 from mavlink_bridge.mission.gimbal import (
     GIMBAL_COMMANDS,
     GimbalTarget,
@@ -21,12 +20,16 @@ from mavlink_bridge.mission.gimbal import (
 )
 from mavlink_bridge.mission.items import (
     DESCENTS,
+    FLY_TOO,
     FRAMES,
+    GIMBAL_ONLY,
     LANDINGS,
+    NO_EFFECT,
     PLACES,
     ROI_COMMANDS,
     TAKEOFFS,
     UNKNOWN_VEHICLE,
+    VIEW,
     HeightAbove,
     LoiterCircle,
     MissionItem,

@@ -11,13 +11,13 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import Figures, GimbalAttitude, VehicleState
+from mavlink_bridge.preflight.client import ParameterClient
 from mavlink_bridge.preflight.failsafes import (
     PARAMETERS,
     PX4_PARAMETERS,
     failsafes,
     px4_failsafes,
 )
-from mavlink_bridge.preflight.parameters import ParameterClient
 from mavlink_bridge.preflight.rules import (
     DoctorFinding,
     ParameterRule,

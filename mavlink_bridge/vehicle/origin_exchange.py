@@ -15,7 +15,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Origin
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.tracker import VehicleTracker

@@ -11,7 +11,7 @@ from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _PERIOD_NS = 1_000_000_000

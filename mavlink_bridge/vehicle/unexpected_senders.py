@@ -10,7 +10,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import Name
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.readings import is_autopilot
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 

@@ -10,8 +10,7 @@ from urllib.parse import urlsplit
 import av
 import numpy as np
 
-from companion.sources.misp import MispTime, sei_nal
-from companion.sources.timing import system_minus_monotonic
+from companion.sources.timing import MispTime, sei_nal, system_minus_monotonic
 from localizer.types import Image
 
 _CLOCK = Fraction(1, 90_000)  # MPEG-TS presentation clock, Hz

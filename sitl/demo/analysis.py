@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.offline.tables import Columns, poses
+from companion.offline.record import Columns, poses
 from companion.reporting.figures import nearest
-from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
+from localizer.evaluation.sequences import LocalizationMetrics, localization_metrics
 from localizer.geometry.pose import Array
 
 _CHI2_95 = 5.991  # of two degrees of freedom

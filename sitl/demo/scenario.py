@@ -1,10 +1,12 @@
-"""Demo scenario file: mission legs, camera, errors, weather, GNSS denial."""
+"""Demo scenario file: mission, camera, weather, GNSS denial, and the errors that a flight draws."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from companion.config import CameraModel
@@ -12,6 +14,8 @@ from companion.settings_file import SettingsError, read_settings, validated
 from localizer.geometry.camera import Camera
 from localizer.synth.config import Character
 from mavlink_bridge.config import StrictModel
+from sitl.camera.detector import DetectorErrors
+from sitl.camera.realism import CameraRealism
 from sitl.errors import SimulationError
 
 VehicleChoice = Literal["auto", "ardupilot", "embedded"]
@@ -206,3 +210,60 @@ def check_inside(scenario: Scenario, size_m: float) -> None:
                 f"legs.{number}: {leg.east_m:g} m east, {leg.north_m:g} m north is outside the "
                 f"world, which reaches {size_m / 2:g} m from home"
             )
+
+
+@dataclass(frozen=True)
+class FlightErrors:
+    """True values that differ from the deployment file.
+
+    camera: the true intrinsics. lever_arm_m: the camera's true position, body axes (the file says
+    zero). map_shift_m: offset of the map from the world (east, north, up).
+    """
+
+    camera: Camera
+    lever_arm_m: tuple[float, float, float]
+    map_shift_m: tuple[float, float, float]
+    realism: CameraRealism
+    detector: DetectorErrors
+
+
+def draw_errors(scenario: Scenario, seed: int) -> FlightErrors:
+    """Draw the errors of a flight from its scenario's standard deviations. Each error has its own
+    random generator, so that disabling one does not change the others.
+    """
+    spec, nominal = scenario.errors, scenario.camera.camera()
+
+    def normal(key: int, count: int) -> np.ndarray:
+        return np.random.default_rng([seed, 41, key]).normal(size=count)
+
+    c = scenario.camera
+    rolls = c.readout_ms > 0
+    readout_ms = max(c.readout_ms + spec.readout_ms * float(normal(6, 1)[0]), 0.0) if rolls else 0.0
+    scale = 1.0 + 0.01 * spec.focal_percent * float(normal(0, 1)[0])
+    principal = spec.principal_px * normal(1, 2)
+    bend = spec.distortion * normal(2, 5) * (1.0, 1.0, 0.1, 0.1, 0.0)
+    k1, k2, p1, p2, k3 = (float(x) for x in np.asarray(nominal.distortion) + bend)
+    camera = Camera(
+        nominal.width, nominal.height, nominal.fx * scale, nominal.fy * scale,
+        nominal.cx + float(principal[0]), nominal.cy + float(principal[1]), (k1, k2, p1, p2, k3),
+        readout_ms,
+    )  # fmt: skip
+    rng = np.random.default_rng([seed, 41, 4])
+    away, bearing = rng.uniform(*spec.map_shift_m), rng.uniform(0, 2 * np.pi)
+    up = spec.map_shift_up_m * float(rng.normal())
+    arm = spec.lever_arm_m * normal(3, 3)
+    realism = CameraRealism(
+        readout_ms, c.vibration_deg, c.auto_exposure, c.supersample, c.packet_loss,
+        spec.stamp_offset_ms * float(normal(5, 1)[0]), spec.stamp_jitter_ms,
+    )  # fmt: skip
+    detector = DetectorErrors(
+        spec.detector_px, spec.detector_missed, spec.detector_false, spec.detector_swapped,
+        spec.detector_box_centre,
+    )  # fmt: skip
+    return FlightErrors(
+        camera,
+        (float(arm[0]), float(arm[1]), float(arm[2])),
+        (float(away * np.sin(bearing)), float(away * np.cos(bearing)), up),
+        realism,
+        detector,
+    )

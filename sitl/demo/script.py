@@ -12,7 +12,7 @@ from sitl.demo.companion_process import FlightCompanion
 from sitl.demo.scenario import Scenario
 from sitl.errors import FlightError
 from sitl.geodesy import Location
-from sitl.ground.mission_steps import MissionStep, gimbal_step, speed_step, waypoint_step
+from sitl.ground.mission_client import MissionStep, gimbal_step, speed_step, waypoint_step
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import VISION_SOURCE
 

@@ -8,11 +8,10 @@ import sys
 from pathlib import Path
 from types import FrameType
 
-from sitl.embedded.errors import VehicleError
 from sitl.embedded.mavlink.server import MavlinkServer
-from sitl.embedded.parameters import Parameters, read_parameter_file
-from sitl.embedded.px4_parameters import Px4Parameters
+from sitl.embedded.parameters import Parameters, Px4Parameters, read_parameter_file
 from sitl.embedded.vehicle import EmbeddedVehicle
+from sitl.errors import VehicleError
 from sitl.geodesy import Location
 
 SERIAL_OFFSETS = (0, 2, 3)  # serial0, serial1, serial2 of ArduPilot SITL, from the base port

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from sitl.embedded.control.mode import Mode
 from sitl.embedded.control.px4_modes import NUMBERS, custom_mode
 from sitl.errors import PilotError
 from sitl.geodesy import Location
-from sitl.ground.statustext import StatusText, TextLog
 from sitl.ground.tracks import (
     EkfSample,
     GimbalState,
@@ -23,6 +23,43 @@ from sitl.ground.tracks import (
     interpolate,
     slerp,
 )
+
+
+@dataclass(frozen=True)
+class StatusText:
+    """A status text of any component, as far as its chunks have arrived."""
+
+    time_ns: int
+    severity: int
+    text: str
+    component: int
+
+
+class TextLog:
+    """Status texts in order of their first chunks; one thread fills it, any may read `lines`.
+
+    A missing chunk is shown as three dots. An id may be used again for another text.
+    """
+
+    def __init__(self) -> None:
+        self.lines: list[StatusText] = []
+        self._open: dict[tuple[int, int], tuple[int, int, int]] = {}
+
+    def add(self, message: Any, received_ns: int) -> None:
+        """Add one STATUSTEXT: a new text, or the next chunk of one that is not complete."""
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        number, chunk = message.id, message.chunk_seq
+        line = StatusText(received_ns, message.severity, message.text, source[1])
+        open_id, place, expected = self._open.get(source, (0, 0, 0))
+        if number and number == open_id and chunk >= expected:
+            gap = "..." if chunk > expected else ""
+            begun = self.lines[place]
+            self.lines[place] = replace(begun, text=begun.text + gap + line.text)
+        else:
+            place = len(self.lines)
+            self.lines.append(replace(line, text="..." + line.text) if chunk else line)
+        self._open[source] = (number, place, chunk + 1)
+
 
 VEHICLE, AUTOPILOT = 1, 1  # system and component
 _SECONDS_KEPT = 60 * 60

@@ -15,7 +15,7 @@ from companion.preflight.coverage import is_covered
 from companion.settings_file import SettingsError, validated
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets

@@ -47,7 +47,7 @@ class VehicleProcess(ABC):
     a file there, or to `log`, which stays; errors quote the end of it.
 
     home: altitude AMSL. parameters: over the vehicle's defaults. seed, px4: the embedded vehicle's
-    noise, and whether it has PX4's interface (`sitl.embedded.px4_parameters`).
+    noise, and whether it has PX4's interface (`sitl.embedded.parameters`).
     """
 
     kind: VehicleKind

@@ -12,8 +12,7 @@ from pydantic import BaseModel
 
 from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
-from companion.renamed_keys import REMOVED, RENAMED
-from companion.settings_file import nested_models, settable_fields
+from companion.settings_file import REMOVED, RENAMED, nested_models, settable_fields
 from mavlink_bridge import BridgeConfig
 from tests.bounds import unbounded
 

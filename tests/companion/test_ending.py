@@ -18,7 +18,7 @@ from companion.conversions import CameraExtrinsics
 from companion.ending import wait_for_end
 from companion.flight.last_fix import FixMemory
 from companion.flight.recorder import RecordKeeper
-from companion.supervision.pulse import Pulse
+from companion.supervision.processes import Pulse
 from companion.targets.reporter import TargetReporter
 from companion.targets.target_manager import Click
 from localizer.geometry.geo import Geodetic, LocalFrame

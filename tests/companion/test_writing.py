@@ -16,19 +16,17 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
-from companion.errors import FootageError, ReportError
+from companion.errors import FootageError, ReportError, redacted
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from companion.recorded.autopilot_log import read_autopilot_log
-from companion.redaction import redacted
 from companion.reporting.content import Report
 from companion.reporting.layout import write_report
 from companion.sources import SourceSettings, StreamState, open_source
 from companion.targets.detections import Detection, parse_detection
 from companion.writing import refuse_input, result_file, write_result
-from localizer.evaluation.metrics import LocalizationMetrics
-from localizer.evaluation.sequences import CSV_COLUMNS
+from localizer.evaluation.sequences import CSV_COLUMNS, LocalizationMetrics
 from localizer.geometry.camera import Camera
-from localizer.geometry.posefile import read_poses
+from localizer.geometry.trajectory import read_poses
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.messages import HealthLevel

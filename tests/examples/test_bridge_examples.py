@@ -30,8 +30,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
-from sitl.vehicles.ardupilot import ArduPilotSitl
-from sitl.vehicles.launch import EmbeddedSitl, vision_only_parameters
+from sitl.vehicles.launch import ArduPilotSitl, EmbeddedSitl, vision_only_parameters
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 HOME = Location(47.397742, 8.545594, 488.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -10,11 +10,9 @@ import yaml
 
 from localizer.errors import CameraError, MapCacheError, PoseFileError
 from localizer.geometry.camera import Camera
-from localizer.geometry.posefile import read_poses
-from localizer.geometry.trajectory import read_tum
+from localizer.geometry.trajectory import read_poses, read_tum
 from localizer.map.cache.cache import TileCache
-from localizer.plain_files import files_of, plain_bytes, plain_text
-from localizer.strict_yaml import load_yaml
+from localizer.plain_files import files_of, load_yaml, plain_bytes, plain_text
 
 
 def test_a_plain_file_is_read_whole_up_to_its_bound(tmp_path):

@@ -26,11 +26,11 @@ from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.transport import Endpoint
 from mavlink_bridge.messages import PlaceHint, TrackRequest
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
-from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+from mavlink_bridge.vehicle_events import VehicleWatch
 
 MS = 1_000_000
 SECOND = 1_000 * MS

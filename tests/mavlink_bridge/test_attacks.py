@@ -21,7 +21,7 @@ from mavlink_bridge.components import Components
 from mavlink_bridge.config import BridgeConfig, InjectionEnableConfig, SigningConfig
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
-from mavlink_bridge.link.replay import ReplayWindow
+from mavlink_bridge.link.signing import ReplayWindow
 from tests.mavlink_bridge.simulated import HOME, METRE, Flight, heartbeat, origin_message
 
 KEY = bytes(range(1, 33))

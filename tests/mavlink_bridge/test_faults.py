@@ -15,9 +15,9 @@ from mavlink_bridge import TargetReport
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, cleared
 from mavlink_bridge.alerts.ids import AlertId
+from mavlink_bridge.components import GroundEnd
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.flight_controller import FC_WANTED
-from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 from mavlink_bridge.link.framing import FrameReader
 from tests.mavlink_bridge.simulated import (

@@ -16,8 +16,7 @@ from mavlink_bridge.camera.look_at import LOOK_AHEAD, LOOK_AT_PLACE, LOOK_AT_TAR
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.ardupilot import ArduPilotSitl
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
+from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl
 
 SECOND = 10**9
 OK, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.camera.messages import camera_fov_status
-from mavlink_bridge.camera.targets import adsb_vehicle, tracking_geo_status
+from mavlink_bridge.camera.messages import adsb_vehicle, camera_fov_status, tracking_geo_status
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.errors import FixError
 from mavlink_bridge.messages import CameraView, TargetReport, VisionFix

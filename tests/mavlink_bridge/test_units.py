@@ -12,11 +12,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.camera.messages import (
+    adsb_vehicle,
     camera_fov_status,
     camera_information,
+    tracking_geo_status,
     video_stream_information,
 )
-from mavlink_bridge.camera.targets import adsb_vehicle, tracking_geo_status
 from mavlink_bridge.config import BridgeConfig, CameraConfig, InjectionConfig, OriginConfig
 from mavlink_bridge.injection.encode import (
     EncodedEstimate,

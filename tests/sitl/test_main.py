@@ -5,7 +5,7 @@ from typer.testing import CliRunner
 
 from sitl import __main__ as cli
 from sitl.demo.scenario import ScenarioError
-from sitl.vehicles.ardupilot import ArduPilotNotFoundError
+from sitl.vehicles.launch import ArduPilotNotFoundError
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from companion.config import CompanionConfig
 from companion.conversions import CameraExtrinsics
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME, Recorder, write_manifest
-from companion.offline.autopilot import RecordedAutopilot
+from companion.offline.replay import RecordedAutopilot
 from companion.recorded.flight import LogBeside
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera

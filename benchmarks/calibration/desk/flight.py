@@ -14,7 +14,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.vehicle.streams import wanted_streams
-from sitl.camera.gimbal_error import GimbalError
+from sitl.camera.pose_sender import GimbalError
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.parameters import Parameters

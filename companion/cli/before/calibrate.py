@@ -142,8 +142,7 @@ def board_command(
 
 
 def _film(source: str, seconds: float, keep: Path | None, config: Path | None) -> None:
-    from companion.calibrate.board import watch_board
-    from companion.calibrate.lens import solve_lens
+    from companion.calibrate.board import solve_lens, watch_board
     from companion.calibrate.proposal import lens_changes, write_changed
 
     def told(taken: int, word: str, missing: list[str]) -> None:

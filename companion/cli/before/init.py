@@ -12,8 +12,7 @@ from rich.markup import escape
 
 from companion.cli.output import tell
 from companion.config import CompanionConfig, parse_config
-from companion.errors import CompanionError, ConfigError
-from companion.redaction import redacted
+from companion.errors import CompanionError, ConfigError, redacted
 from companion.terminal.steps import show_work
 from companion.writing import result_file
 from localizer.errors import LocalizerError
@@ -59,8 +58,8 @@ def init_command(
     ] = False,
 ) -> None:
     """Ask for map, stream and vehicle, read their settings, and write a short deployment file."""
-    from companion.setup.reference import reference as all_settings
     from companion.setup.write import deployment_text, write_deployment
+    from companion.setup.write import reference as all_settings
 
     if reference:
         typer.echo(all_settings(), nl=False)
@@ -148,7 +147,7 @@ def _map_hash(map_cache: Path) -> str:
 
 
 def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
-    from companion.setup.asking import read_stream_size
+    from companion.setup.write import read_stream_size
 
     try:
         width, height = read_stream_size(feed)

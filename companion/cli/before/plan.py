@@ -49,13 +49,13 @@ def plan_command(
     alternatives: Annotated[bool, typer.Option(help="search alternatives for failing legs")] = True,
 ) -> None:
     """Forecast a mission over its map. Exit code 1: a leg fails, or not all was judged."""
-    from companion.planning import flown as check
-    from companion.planning import page, pictures
+    from companion.planning import page
+    from companion.planning import verdicts as check
     from companion.planning.mission import read_mission
     from companion.planning.plan import Question, aim_of, make_plan
     from companion.planning.verdicts import MissionLimits
     from companion.preflight.map_pin import map_hash
-    from localizer.forecast.visit import FORECAST_CONDITIONS
+    from localizer.forecast.forecast import FORECAST_CONDITIONS
     from localizer.map.cache.cache import TileCache
     from localizer.pictures import write_rgb
 
@@ -78,11 +78,11 @@ def plan_command(
         plan = make_plan(planned, cache, deployment, question, count)
     camera = deployment.camera.model.camera().without_distortion()
     with show_work(Console(stderr=True), "drawing the pictures"):
-        sheet = pictures.render_map_square(plan, cache)
+        sheet = page.render_map_square(plan, cache)
         aim = aim_of(deployment, pitch)
         shown = (
-            ("Track", pictures.track_picture(sheet, plan)),
-            ("Ground that is seen", pictures.heat_picture(sheet, plan, cache, camera, aim)),
+            ("Track", page.track_picture(sheet, plan)),
+            ("Ground that is seen", page.heat_picture(sheet, plan, cache, camera, aim)),
         )
     legs = () if frames is None else check.flown_legs(plan.verdicts, *frames)
     document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}

@@ -14,8 +14,7 @@ from rich.text import Text
 
 from companion.cli.before.shared_options import FieldOfView, FootageCamera, MountPitch, WorkingWidth
 from companion.cli.output import tell, tell_notes
-from companion.terminal.links import file_link
-from companion.terminal.steps import COMPILES, show_count, show_steps
+from companion.terminal.steps import COMPILES, file_link, show_count, show_steps
 from companion.writing import make_folder, refuse_input
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def try_command(
 
 
 def _print_map(flight: RecordedFlight) -> None:
-    from companion.trial.wanted_map import flat_map_advice, wanted_map
+    from companion.trial.result import flat_map_advice, wanted_map
 
     tell_notes((f"camera by {flight.camera.source}", *flight.notes))
     wanted = wanted_map(flight)

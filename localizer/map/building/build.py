@@ -1,32 +1,214 @@
-"""Builds a tile cache from any importer's tiles, in parallel and atomically."""
+"""Builds a tile cache from any importer's tiles, in parallel and atomically; tree and manifest."""
 
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
-from localizer.map.building.assembly import assemble
+from localizer.geometry.pose import Array
 from localizer.map.building.content import (
     extent_warnings,
     heights_of,
     require_in_volumes,
     require_upright,
 )
-from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
 from localizer.map.building.sources import find_source, read_source
-from localizer.map.building.staging import TileRecord, publish, staging, write_index
-from localizer.map.building.workers import ImportJob, Progress, import_all, tiles_of
-from localizer.map.cache.cache import Manifest
+from localizer.map.building.staging import (
+    Staging,
+    StoredTile,
+    TileRecord,
+    publish,
+    staging,
+    write_index,
+)
+from localizer.map.building.workers import (
+    ImportJob,
+    Progress,
+    call_in_process,
+    import_all,
+    tiles_of,
+)
+from localizer.map.cache.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
 from localizer.map.inspection.kind import measure_kind
 from localizer.map.kind import IMAGERY_DATE
 from localizer.map.source import SourceNode, SourceTree
+
+
+@dataclass(eq=False)
+class _Node:
+    """A node of the tree with the records of its tiles."""
+
+    source: SourceNode
+    keys: list[int]
+    records: list[TileRecord]
+    children: list[_Node]
+
+    @property
+    def tiles(self) -> list[StoredTile]:
+        return [tile for record in self.records for tile in record.tiles]
+
+    @property
+    def failed(self) -> bool:
+        return any(record.error is not None for record in self.records)
+
+
+def _graft(root: SourceNode, records: dict[int, TileRecord]) -> _Node:
+    """The tree with records, pruned where a tile is missing.
+
+    If a child of a REPLACE node could not be imported, all children of this node are left out: its
+    coarser surface is shown, and there is no hole.
+    """
+    first: dict[int, int] = {}
+    key = 0
+    order = list(root.walk())
+    for node in order:
+        first[id(node)] = key
+        key += len(node.tiles)
+    built: dict[int, _Node] = {}
+    for node in reversed(order):
+        keys = list(range(first[id(node)], first[id(node)] + len(node.tiles)))
+        children = [built.pop(id(c)) for c in node.children]
+        result = _Node(node, keys, [records[k] for k in keys], children)
+        whole = all(_covers(c) for c in children)
+        if node.replaces and node.stands_in and result.tiles and not whole:
+            result.children = []
+        result.children = [c for c in result.children if c.tiles or c.children]
+        built[id(node)] = result
+    return built[id(root)]
+
+
+def _covers(node: _Node) -> bool:
+    """Whether the node, or its children instead of it, were imported completely."""
+    if node.failed:
+        return bool(node.children) and all(_covers(c) for c in node.children)
+    return True
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """A cache before publishing. figures: fields of the `Manifest` that the tiles determine;
+    leaves: the finest tiles; volumes: ECEF corners (8, 3) that the source states for nodes, with
+    their tiles.
+    """
+
+    index: TileIndex
+    figures: dict[str, Any]
+    leaves: list[StoredTile]
+    volumes: list[tuple[Array, list[StoredTile]]]
+
+
+def assemble(
+    tree: SourceTree, records: dict[int, TileRecord], staged: Staging, frame: LocalFrame
+) -> Assembled:
+    """Place the imported tiles in the staging folder. `MapSourceError` if no tile has a surface."""
+    root = _graft(tree.root, records)
+    nodes = [root]
+    child_start = []
+    for node in nodes:  # grows while it is walked: breadth first, children side by side
+        child_start.append(len(nodes))
+        nodes.extend(node.children)
+    tiles: list[StoredTile] = []
+    tile_start = []
+    for node in nodes:
+        tile_start.append(len(tiles))
+        for key, record in zip(node.keys, node.records, strict=True):
+            for part, tile in enumerate(record.tiles):
+                _link(staged.tile_path(key, part), staged.folder / tile_name(len(tiles)))
+                tiles.append(tile)
+    if not tiles:
+        raise MapSourceError("not one tile of the source has a surface")
+    low, high = _boxes(nodes, child_start)
+    index = TileIndex(
+        box_min=low,
+        box_max=high,
+        geometric_error=np.array([n.source.geometric_error for n in nodes]),
+        gsd=np.array([max((t.gsd for t in n.tiles), default=0.0) for n in nodes]),
+        refine=np.array([REPLACE if n.source.replaces else ADD for n in nodes], np.uint8),
+        child_start=np.array(child_start, np.int32),
+        child_count=np.array([len(n.children) for n in nodes], np.int32),
+        tile_start=np.array(tile_start, np.int32),
+        tile_count=np.array([len(n.tiles) for n in nodes], np.int32),
+        ecef_from_tile=_tile_transforms(tiles, frame),
+        size=np.array([t.size for t in tiles], np.int64),
+        digest=np.array([list(bytes.fromhex(t.sha256)) for t in tiles], np.uint8),
+    )
+    return Assembled(
+        index,
+        _figures(nodes, child_start, tiles, frame),
+        [tile for node in nodes if not node.children for tile in node.tiles],
+        [(n.source.corners, n.tiles) for n in nodes if n.source.corners is not None and n.tiles],
+    )
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)  # the part stays, so that a build killed here can go on
+    except OSError:
+        os.replace(source, target)
+
+
+def _boxes(nodes: list[_Node], child_start: list[int]) -> tuple[Array, Array]:
+    low = np.full((len(nodes), 3), np.inf)
+    high = np.full((len(nodes), 3), -np.inf)
+    for i in reversed(range(len(nodes))):
+        for tile in nodes[i].tiles:
+            low[i] = np.minimum(low[i], tile.box_min)
+            high[i] = np.maximum(high[i], tile.box_max)
+        below = slice(child_start[i], child_start[i] + len(nodes[i].children))
+        if nodes[i].children:
+            low[i] = np.minimum(low[i], low[below].min(axis=0))
+            high[i] = np.maximum(high[i], high[below].max(axis=0))
+    return low, high
+
+
+def _tile_transforms(tiles: list[StoredTile], frame: LocalFrame) -> Array:
+    transforms = np.tile(frame.ecef_from_enu.matrix, (len(tiles), 1, 1))
+    transforms[:, :3, 3] = frame.ecef_from_enu.apply(np.array([t.center for t in tiles]))
+    return transforms
+
+
+def _figures(
+    nodes: list[_Node], child_start: list[int], tiles: list[StoredTile], frame: LocalFrame
+) -> dict[str, Any]:
+    depth = np.ones(len(nodes), int)
+    for i, node in enumerate(nodes):
+        depth[child_start[i] : child_start[i] + len(node.children)] = depth[i] + 1
+    leaves = [t for n in nodes if not n.children for t in n.tiles]
+    gsd = [t.gsd for t in leaves if t.gsd > 0]
+    corners = np.array([c for t in leaves for c in (t.box_min, t.box_max)])
+    boxes = np.array([(*t.box_min, *t.box_max) for t in leaves])
+    footprint = np.concatenate(
+        [boxes[:, [0, 1]], boxes[:, [3, 1]], boxes[:, [3, 4]], boxes[:, [0, 4]]]
+    )
+    try:
+        outline = footprint[ConvexHull(footprint).vertices]
+    except QhullError as error:
+        raise MapSourceError("the source's surface has no extent on the ground") from error
+    flat = np.column_stack([outline, np.zeros(len(outline))])
+    geodetic = frame.geodetic_from_enu(flat)
+    heights = frame.geodetic_from_enu(corners)[:, 2]
+    return {
+        "gsd_m": float(np.median(gsd)) if gsd else 0.0,
+        "levels": int(depth.max()),
+        "tiles": len(tiles),
+        "triangles": sum(t.triangles for t in leaves),
+        "bytes": sum(t.file_bytes for t in tiles),
+        "extent": tuple((float(lat), float(lon)) for lat, lon, _ in geodetic),
+        "height_range_m": (float(heights.min()), float(heights.max())),
+    }
+
 
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 

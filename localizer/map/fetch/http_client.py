@@ -12,7 +12,7 @@ from urllib.parse import urljoin, urlsplit
 from xml.etree import ElementTree
 
 from localizer.errors import MapFetchError
-from localizer.map.fetch.terms import require_allowed
+from localizer.map.fetch.catalogue import require_allowed
 
 try:
     import urllib3

@@ -11,10 +11,9 @@ from urllib.parse import urlencode, urljoin
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
-from localizer.map.fetch.catalogue import CatalogueSource
+from localizer.map.fetch.catalogue import CatalogueSource, require_allowed
 from localizer.map.fetch.cloud import CloudFile
 from localizer.map.fetch.http_client import HttpClient, safe_url
-from localizer.map.fetch.terms import require_allowed
 
 _MOST_ITEMS, _MOST_PAGES = 2000, 50
 _PAGE = 100  # items that are asked for at once; a service may give fewer

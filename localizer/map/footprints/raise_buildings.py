@@ -22,8 +22,7 @@ from rasterio.io import DatasetReader
 
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
-from localizer.map.footprints.citygml import read_citygml
-from localizer.map.footprints.footprint import Footprint, Footprints, read_geojson
+from localizer.map.footprints.footprint import Footprint, Footprints, read_citygml, read_geojson
 from localizer.map.importers.height_crs import horizontal_unit_m, stated_heights
 from localizer.map.importers.raster_file import apply_affine, offline, open_raster
 

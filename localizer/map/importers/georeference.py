@@ -18,8 +18,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.pose import Array, so3_exp
 from localizer.map.importers.height_crs import horizontal_unit_m, place_doubts
 from localizer.map.importers.rules import ImportRules
-from localizer.plain_files import plain_text
-from localizer.strict_yaml import load_json
+from localizer.plain_files import load_json, plain_text
 
 UpAxis = Literal["y", "z"]
 

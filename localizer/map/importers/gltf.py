@@ -27,11 +27,11 @@ from localizer.map.importers.gltf_data import (
     normalised_bounds,
     vector,
 )
-from localizer.map.importers.materials import cut_out, material_of
-from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
-from localizer.map.importers.textures import (
+from localizer.map.importers.materials import (
+    cut_out,
     decode_alpha,
     decode_image,
+    material_of,
     merge_by_image,
     palette_mesh,
     picture_size,
@@ -39,6 +39,7 @@ from localizer.map.importers.textures import (
     tinted,
     transform_mesh,
 )
+from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
 from localizer.map.source import SourceMesh
 from localizer.types import Image
 

@@ -19,10 +19,15 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.importers.georeference import Georeference, UpAxis
 from localizer.map.importers.gltf import read_gltf
-from localizer.map.importers.materials import MtlMaterial, cut_out, read_mtl
+from localizer.map.importers.materials import (
+    MtlMaterial,
+    cut_out,
+    palette_mesh,
+    read_mtl,
+    require_readable,
+)
 from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
-from localizer.map.importers.textures import palette_mesh, require_readable
 from localizer.map.importers.tiles3d import read_file, resolve_inside
 from localizer.map.source import SourceMesh
 from localizer.plain_files import decode_lenient

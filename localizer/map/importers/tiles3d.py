@@ -18,9 +18,9 @@ from localizer.geometry.pose import Array
 from localizer.map.importers.georeference import UpAxis
 from localizer.map.importers.gltf import gltf_bounds, gltf_weight, read_gltf
 from localizer.map.importers.gltf_data import vector
+from localizer.map.importers.materials import transform_mesh
 from localizer.map.importers.referenced_files import file_of, files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
-from localizer.map.importers.textures import transform_mesh
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 
 _MAX_USES = 64  # of one tileset: each of a few that name each other multiplies their tiles

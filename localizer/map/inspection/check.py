@@ -14,10 +14,15 @@ from localizer.errors import MapCacheError
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.tile import orientation_fault, vector_area
-from localizer.map.inspection.alignment import ImageryOffset, measure_alignment
+from localizer.map.inspection.alignment import (
+    ImageryOffset,
+    Mosaic,
+    UsableArea,
+    measure_alignment,
+    render_mosaic,
+    usable_part,
+)
 from localizer.map.inspection.kind import map_kind
-from localizer.map.inspection.mosaic import Mosaic, render_mosaic
-from localizer.map.inspection.usable import UsableArea, usable_part
 from localizer.map.kind import HEIGHTS_HOLD, MapKind
 from localizer.types import Image
 

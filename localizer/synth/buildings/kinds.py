@@ -6,8 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from localizer.synth.buildings.model import ALL_LEVELS, NEAR_LEVELS, Building, Colour, Kind, Surface
-from localizer.synth.buildings.shell import NO_PARAMS, Shell
+from localizer.synth.buildings.shell import (
+    ALL_LEVELS,
+    NEAR_LEVELS,
+    NO_PARAMS,
+    Building,
+    Colour,
+    Kind,
+    Shell,
+    Surface,
+)
 from localizer.synth.paint.covers import Cover, FacadeStyle
 
 PLASTER: tuple[Colour, ...] = (

@@ -7,8 +7,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from localizer.synth.paint.covers import Cover, FacadeStyle
-from localizer.synth.paint.noise import as_byte, bilinear, hash01, noise, smooth_step
+from localizer.synth.paint.covers import (
+    Cover,
+    FacadeStyle,
+    as_byte,
+    bilinear,
+    hash01,
+    noise,
+    smooth_step,
+)
 
 
 @njit(cache=True, nogil=True, fastmath=True)

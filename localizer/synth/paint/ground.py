@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from localizer.synth.paint.covers import as_byte, bilinear, hash01, noise, smooth_step
 from localizer.synth.paint.ground_plan import Material
-from localizer.synth.paint.noise import as_byte, bilinear, hash01, noise, smooth_step
 
 
 @njit(cache=True, nogil=True, fastmath=True)

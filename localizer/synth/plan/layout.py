@@ -9,7 +9,7 @@ import numpy as np
 
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
-from localizer.synth.buildings.model import Building, Kind, Surface, rectangle
+from localizer.synth.buildings.shell import Building, Kind, Surface, rectangle
 from localizer.synth.config import WorldConfig
 from localizer.synth.paint.ground_plan import GroundPlan, Material
 from localizer.synth.plan.country import (
@@ -17,18 +17,22 @@ from localizer.synth.plan.country import (
     plan_farm,
     plan_field,
     plan_forest,
+    plan_houses,
     plan_meadow,
     plan_orchard,
     plan_riverside,
 )
-from localizer.synth.plan.houses import plan_houses
-from localizer.synth.plan.plan import URBAN, PlannedTarget, Trees, WorldPlan, Zone
 from localizer.synth.plan.planner import (
     CROSS,
     LAYER_BASE,
     LAYER_WATER,
+    URBAN,
     Occupancy,
+    PlannedTarget,
     Planner,
+    Trees,
+    WorldPlan,
+    Zone,
     main_axis,
 )
 from localizer.synth.plan.streets import (

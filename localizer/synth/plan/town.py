@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from localizer.geometry.pose import Array
-from localizer.synth.buildings.model import Kind, rectangle
+from localizer.synth.buildings.shell import Kind, rectangle
 from localizer.synth.paint.ground_plan import Material
 from localizer.synth.plan.planner import (
     LAYER_GARDEN,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
-from localizer.synth.buildings.model import LEAF, MID, NEAR_LEVELS, ROOT, TOP
+from localizer.synth.buildings.shell import LEAF, MID, NEAR_LEVELS, ROOT, TOP
 from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
 from localizer.synth.paint.covers import WindowLight, new_image
 from localizer.synth.paint.ground import light_ground, paint_albedo
@@ -19,10 +19,9 @@ from localizer.synth.paint.ground_plan import Material, PlanShape, rasterize, sh
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light
 from localizer.synth.plan.terrain import Terrain
 from localizer.synth.tiles.charts import ChartedMesh, pack
-from localizer.synth.tiles.objects import StandingObjects
-from localizer.synth.tiles.scene import TileScene
+from localizer.synth.tiles.scene import StandingObjects, TileScene
 from localizer.synth.tiles.write import TileNode, glb_bytes
-from localizer.synth.visits.texture import noise, with_new_texture, with_wet_patches
+from localizer.synth.visits.visit import noise, with_new_texture, with_wet_patches
 from localizer.types import Float32, Image
 
 _LIGHT_MARGIN_M = 60.0  # objects belong to the tile of their middle and reach out of it

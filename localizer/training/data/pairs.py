@@ -27,11 +27,16 @@ from localizer.synth.heightfield.scene import (
     light_scene,
     omit_randomly,
 )
-from localizer.synth.visits.texture import draw_texel, with_new_texture, with_wet_patches
-from localizer.training.places.changes import coarse_mesh, plain_walls, season_shift
-from localizer.training.places.land import generated_place, photo_place
-from localizer.training.places.objects import TrainingPlace, new_buildings, parked_cars
-from localizer.training.places.photos import PhotoLibrary
+from localizer.synth.visits.visit import draw_texel, with_new_texture, with_wet_patches
+from localizer.training.places.land import PhotoLibrary, generated_place, photo_place
+from localizer.training.places.objects import (
+    TrainingPlace,
+    coarse_mesh,
+    new_buildings,
+    parked_cars,
+    plain_walls,
+    season_shift,
+)
 from localizer.types import Float32, Image
 
 FIRST_WORLD_SEED = 1000  # those below belong to demos and tests

@@ -18,7 +18,7 @@ from localizer.errors import LocalizerError, SequenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.training.data.pairs import Pair, SceneConfig, scene_pairs
-from localizer.training.places.photos import PhotoLibrary
+from localizer.training.places.land import PhotoLibrary
 
 WORLD_SHARDS = 8  # per mesh world
 WORLD_SHARD_PAIRS = 10

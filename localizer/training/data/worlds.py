@@ -21,8 +21,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.config import SURVEY, WorldConfig
-from localizer.synth.visits.texture import coarser, draw_texel
-from localizer.synth.visits.visit import Visit, draw_look
+from localizer.synth.visits.visit import Visit, coarser, draw_look, draw_texel
 from localizer.synth.world import WorldInfo, build_visits
 from localizer.training.data.pairs import (
     FIRST_WORLD_SEED,

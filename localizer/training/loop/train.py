@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from localizer.errors import ModelError
 from localizer.training.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
-from localizer.training.data.streams import open_stream
+from localizer.training.data.batches import open_stream
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import degrees, isnan, radians
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -9,13 +10,252 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.ekf.injection import Clock
-from sitl.embedded.mavlink.gimbal_commands import GimbalCommands
-from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
-from sitl.embedded.mavlink.navigation_commands import NavigationCommands
-from sitl.embedded.mavlink.parameter_commands import ParameterCommands
+from sitl.embedded.mavlink.handling import (
+    ACCEPTED,
+    DENIED,
+    FAILED,
+    UNSUPPORTED,
+    CommandHandler,
+    Handler,
+    location_of,
+)
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import TelemetryBuilder
+from sitl.embedded.physics.gimbal import FLAG_NEUTRAL, FLAG_YAW_LOCK
 from sitl.embedded.severity import INFO, WARNING
+from sitl.geodesy import Location
+
+_IGNORE_POSITION, _IGNORE_YAW = 7, 1 << 10
+_SET_GLOBAL_ORIGIN = 611  # MAV_CMD_DO_SET_GLOBAL_ORIGIN, newer than pymavlink's dialect
+
+
+class NavigationCommands:
+    """Handlers by message name and by command number."""
+
+    def __init__(self, vehicle: Aircraft) -> None:
+        self._vehicle = vehicle
+        self.messages: dict[str, Handler] = {
+            "SET_GPS_GLOBAL_ORIGIN": self._set_origin_message,
+            "SET_POSITION_TARGET_GLOBAL_INT": self._target_global,
+            "MISSION_SET_CURRENT": self._mission_set_current,
+        }
+        m = mavlink
+        self.commands: dict[int, CommandHandler] = {
+            m.MAV_CMD_NAV_TAKEOFF: self._takeoff,
+            _SET_GLOBAL_ORIGIN: self._set_origin,
+            m.MAV_CMD_DO_SET_HOME: self._set_home,
+            m.MAV_CMD_SET_EKF_SOURCE_SET: self._set_source,
+            m.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: self._external_position,
+            m.MAV_CMD_MISSION_START: self._mission_start,
+            m.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
+            m.MAV_CMD_CONDITION_YAW: self._condition_yaw,
+            m.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
+            m.MAV_CMD_DO_REPOSITION: self._reposition,
+        }
+
+    def _takeoff(self, _link: SerialPort, command: Any) -> int:
+        height = command.z if command.get_type() == "COMMAND_INT" else command.param7
+        return ACCEPTED if self._vehicle.modes.takeoff(height) else FAILED
+
+    def _set_origin(self, _link: SerialPort, command: Any) -> int:
+        if command.get_type() != "COMMAND_INT":
+            return UNSUPPORTED
+        return self._new_origin(command.x, command.y, command.z)
+
+    def _set_origin_message(self, _link: SerialPort, message: Any) -> None:
+        self._new_origin(message.latitude, message.longitude, message.altitude / 1000.0)
+
+    def _new_origin(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> int:
+        if not (abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000):
+            return DENIED
+        location = Location(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_m)
+        return ACCEPTED if self._vehicle.estimator.set_origin(location) else FAILED
+
+    def _set_home(self, _link: SerialPort, command: Any) -> int:
+        v = self._vehicle
+        if v.estimator.origin is None:
+            return FAILED
+        if command.param1 == 1:
+            if v.estimator.location is None:
+                return FAILED
+            v.modes.home = v.estimator.location
+        elif command.get_type() == "COMMAND_INT":
+            v.modes.home = Location(command.x / 1e7, command.y / 1e7, command.z)
+        else:
+            return UNSUPPORTED
+        return ACCEPTED
+
+    def _set_source(self, _link: SerialPort, command: Any) -> int:
+        source = int(command.param1)
+        if source not in (1, 2, 3):
+            return DENIED
+        self._vehicle.use_source(source)
+        return ACCEPTED
+
+    def _external_position(self, _link: SerialPort, command: Any) -> int:
+        v = self._vehicle
+        if command.get_type() != "COMMAND_INT" or v.estimator.origin is None:
+            return FAILED
+        north, east, _ = v.estimator.origin.ned_of(Location(command.x / 1e7, command.y / 1e7, 0.0))
+        sigma = command.param3 if command.param3 > 0 else 10.0
+        return ACCEPTED if v.estimator.sources.force_position(north, east, sigma) else FAILED
+
+    def _mission_start(self, _link: SerialPort, _command: Any) -> int:
+        return ACCEPTED if self._vehicle.modes.start_mission() else FAILED
+
+    def _set_current(self, _link: SerialPort, command: Any) -> int:
+        return ACCEPTED if self._vehicle.modes.start_mission(int(command.param1)) else FAILED
+
+    def _mission_set_current(self, _link: SerialPort, message: Any) -> None:
+        self._vehicle.modes.start_mission(message.seq)
+
+    def _condition_yaw(self, _link: SerialPort, command: Any) -> int:
+        self._vehicle.modes.condition_yaw(command.param1, command.param3, bool(command.param4))
+        return ACCEPTED
+
+    def _change_speed(self, _link: SerialPort, command: Any) -> int:
+        return ACCEPTED if self._vehicle.modes.change_speed(command.param2) else FAILED
+
+    def _reposition(self, _link: SerialPort, command: Any) -> int:
+        if command.get_type() != "COMMAND_INT":
+            return UNSUPPORTED
+        v = self._vehicle
+        location = location_of(v.modes.home, command.frame, command.x, command.y, command.z)
+        if location is None:
+            return DENIED
+        if v.modes.mode is not Mode.GUIDED and not (
+            int(command.param2) & 1 and v.modes.set_mode(Mode.GUIDED)
+        ):
+            return DENIED
+        yaw = None if isnan(command.param4) else radians(command.param4)
+        return ACCEPTED if v.modes.go_to(location, yaw) else DENIED
+
+    def _target_global(self, _link: SerialPort, message: Any) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT: fly to its position. Velocities are ignored."""
+        modes, frame = self._vehicle.modes, message.coordinate_frame
+        location = location_of(modes.home, frame, message.lat_int, message.lon_int, message.alt)
+        if location is not None and not message.type_mask & _IGNORE_POSITION:
+            modes.go_to(location, None if message.type_mask & _IGNORE_YAW else message.yaw)
+
+
+class GimbalCommands:
+    """Handlers by message name and by command number."""
+
+    def __init__(self, vehicle: Aircraft) -> None:
+        self._vehicle = vehicle
+        self.messages: dict[str, Handler] = {
+            "GIMBAL_MANAGER_SET_PITCHYAW": self._gimbal_pitchyaw_message,
+        }
+        m = mavlink
+        self.commands: dict[int, CommandHandler] = {
+            m.MAV_CMD_DO_MOUNT_CONTROL: self._mount_control,
+            m.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW: self._gimbal_pitchyaw,
+            m.MAV_CMD_DO_SET_ROI_LOCATION: self._roi,
+            m.MAV_CMD_DO_SET_ROI: self._roi,
+            m.MAV_CMD_DO_SET_ROI_NONE: self._roi_none,
+        }
+
+    def _mount_control(self, _link: SerialPort, command: Any) -> int:
+        gimbal = self._vehicle.gimbal
+        mode = int(command.z if command.get_type() == "COMMAND_INT" else command.param7)
+        if not gimbal.fitted:
+            return FAILED
+        if mode == 2:  # MAV_MOUNT_MODE_MAVLINK_TARGETING
+            gimbal.point(command.param1, command.param3, yaw_locked=False)
+        elif mode in (0, 1):
+            gimbal.neutral()
+        else:
+            return FAILED
+        return ACCEPTED
+
+    def _gimbal_pitchyaw(self, _link: SerialPort, command: Any) -> int:
+        flags = int(command.x if command.get_type() == "COMMAND_INT" else command.param5)
+        return self._point(command.param1, command.param2, command.param3, command.param4, flags)
+
+    def _gimbal_pitchyaw_message(self, _link: SerialPort, message: Any) -> None:
+        self._point(
+            degrees(message.pitch),
+            degrees(message.yaw),
+            degrees(message.pitch_rate),
+            degrees(message.yaw_rate),
+            message.flags,
+        )
+
+    def _point(
+        self, pitch: float, yaw: float, pitch_rate: float, yaw_rate: float, flags: int
+    ) -> int:
+        gimbal = self._vehicle.gimbal
+        if not gimbal.fitted:
+            return FAILED
+        locked = bool(flags & FLAG_YAW_LOCK)
+        if flags & FLAG_NEUTRAL:
+            gimbal.neutral()
+        elif not (isnan(pitch) or isnan(yaw)):
+            gimbal.point(pitch, yaw, yaw_locked=locked)
+        elif not (isnan(pitch_rate) or isnan(yaw_rate)):
+            gimbal.rotate(pitch_rate, yaw_rate, yaw_locked=locked)
+        else:
+            return FAILED
+        return ACCEPTED
+
+    def _roi(self, _link: SerialPort, command: Any) -> int:
+        v = self._vehicle
+        if not v.gimbal.fitted or command.get_type() != "COMMAND_INT":
+            return FAILED
+        location = location_of(
+            self._vehicle.modes.home, command.frame, command.x, command.y, command.z
+        )
+        if location is None:
+            return FAILED
+        v.gimbal.look_at(location)
+        return ACCEPTED
+
+    def _roi_none(self, _link: SerialPort, _command: Any) -> int:
+        self._vehicle.gimbal.look_at(None)
+        return ACCEPTED
+
+
+class ParameterCommands:
+    """Handlers by message name."""
+
+    def __init__(self, vehicle: Aircraft) -> None:
+        self._vehicle = vehicle
+        self.messages: dict[str, Handler] = {
+            "PARAM_REQUEST_LIST": self._param_list,
+            "PARAM_REQUEST_READ": self._param_read,
+            "PARAM_SET": self._param_set,
+        }
+
+    def _param_value(self, name: str, index: int) -> Any:
+        p = self._vehicle.parameters
+        return mavlink.MAVLink_param_value_message(
+            name.encode(), p.encode_value(name), p.type_of(name), len(p), index
+        )
+
+    def _param_list(self, link: SerialPort, _message: Any) -> None:
+        for index, name in enumerate(self._vehicle.parameters):
+            link.send(self._param_value(name, index))
+
+    def _param_read(self, link: SerialPort, message: Any) -> None:
+        p = self._vehicle.parameters
+        name = _text(message.param_id)
+        found = name if message.param_index < 0 else p.name_at(message.param_index)
+        if found is not None and found in p:
+            link.send(self._param_value(found, p.index_of(found)))
+
+    def _param_set(self, _link: SerialPort, message: Any) -> None:
+        v = self._vehicle
+        name = _text(message.param_id)
+        p = v.parameters
+        if name in p and p.set(name, p.decode_value(name, message.param_value)):
+            # ArduPilot tells every link of a change, with an index of 65535.
+            v.server.broadcast(self._param_value(name, 65535))
+
+
+def _text(value: str | bytes) -> str:
+    text = value.decode("ascii", "replace") if isinstance(value, bytes) else value
+    return text.rstrip("\0")
+
 
 _FORCE_ARM = 21196.0
 

@@ -3,6 +3,10 @@
 Each port accepts one client at a time. ArduPilot's routing rules apply: a link is sent nothing
 until something was received on it, addressed messages go to links on which their target was heard,
 unknown message ids are not forwarded.
+
+Time stamps, as ArduPilot's JitterCorrection: the link's lag is the smallest over 100 samples. A
+sample is never in the future, and at most 500 ms in the past. The smallest lag cannot be measured;
+VISO_DELAY_MS compensates it.
 """
 
 from __future__ import annotations
@@ -17,8 +21,36 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded.ekf.timesync import JitterCorrection
-from sitl.embedded.errors import PortError
+from sitl.errors import PortError
+
+_MAX_LAG_US = 500_000
+_CONVERGENCE = 100
+
+
+class JitterCorrection:
+    """One per link: every time-stamped message of a link shares it."""
+
+    def __init__(self) -> None:
+        self._offset_us: int | None = None
+        self._least_us = 0
+        self._count = 0
+
+    def correct(self, remote_us: int, local_us: int) -> int:
+        """Local time (µs since boot) of a remote time stamp (µs, any epoch)."""
+        difference = local_us - remote_us
+        if self._offset_us is None or difference < self._offset_us:
+            self._offset_us = difference
+        estimate = remote_us + self._offset_us
+        if estimate + _MAX_LAG_US < local_us:
+            estimate = local_us - _MAX_LAG_US
+            self._offset_us = estimate - remote_us
+        self._least_us = difference if self._count == 0 else min(self._least_us, difference)
+        self._count += 1
+        if self._count == _CONVERGENCE:
+            self._offset_us = self._least_us
+            self._count = 0
+        return estimate
+
 
 _MAX_BACKLOG = 1 << 16  # bytes a stalled reader may leave before messages are dropped
 _NEVER_FORWARDED = frozenset({"BAD_DATA", "RADIO", "RADIO_STATUS"})

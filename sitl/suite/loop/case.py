@@ -13,9 +13,8 @@ from mavlink_bridge.config import StrictModel
 from sitl.camera.faults import PictureFault, PictureFaultKind
 from sitl.camera.zoom import MOST as ZOOM_MOST
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
-from sitl.suite.case import load_all, require_known
+from sitl.suite.case import Ramp, load_all, require_known
 from sitl.suite.checks import AlertExpectation
-from sitl.suite.ramp import Ramp
 
 LOOP_SCENARIOS = Path(__file__).parents[2] / "scenarios" / "loop"
 

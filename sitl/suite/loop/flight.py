@@ -17,11 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.offline.record import read_estimates
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import read_tlog
-from sitl.camera.gimbal_error import GimbalError
-from sitl.camera.movers import Mover
-from sitl.camera.pose_sender import truth_feed
+from sitl.camera.movers import Mover, traffic
+from sitl.camera.pose_sender import GimbalError, truth_feed
 from sitl.camera.process import WorldCameraProcess
-from sitl.camera.traffic import traffic
 from sitl.camera.zoom import ReportingCamera, Zooming
 from sitl.demo.assets import FlightAssets
 from sitl.demo.companion_process import (
@@ -35,12 +33,12 @@ from sitl.demo.flight import camera_config, home_of, vehicle_parameters
 from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
+from sitl.suite.case import RunningRamp
 from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import DeploymentErrors, LoopCase, LoopEvent, OperatorHint, Zoom
 from sitl.suite.loop.disturbances import CpuLoad
 from sitl.suite.loop.evaluation import LoopRecord, LoopSample, RestartTimes, standing_alerts
-from sitl.suite.loop.terrain_file import terrain_file
-from sitl.suite.ramp import RunningRamp
+from sitl.suite.loop.inner_map import terrain_file
 from sitl.suite.record import Text
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess

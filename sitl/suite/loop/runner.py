@@ -14,10 +14,17 @@ from sitl.demo.assets import prepare
 from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
 from sitl.suite.loop.case import LoopCase
-from sitl.suite.loop.evaluation import evaluate, false_alarms, figures
+from sitl.suite.loop.evaluation import (
+    LoopRow,
+    as_data,
+    evaluate,
+    false_alarms,
+    figures,
+    markdown,
+    read_rows,
+)
 from sitl.suite.loop.flight import LoopAssets, fly
 from sitl.suite.loop.inner_map import inner_map
-from sitl.suite.loop.report import LoopRow, as_data, markdown, read_rows
 from sitl.vehicles.process import VehicleKind
 
 _MOST_SEEDS = 1000

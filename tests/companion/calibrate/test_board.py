@@ -11,8 +11,14 @@ import yaml
 from PIL import Image as PillowImage
 from typer.testing import CliRunner
 
-from companion.calibrate.board import ACROSS, DOWN, BoardViews, board_picture, write_sheet
-from companion.calibrate.lens import solve_lens
+from companion.calibrate.board import (
+    ACROSS,
+    DOWN,
+    BoardViews,
+    board_picture,
+    solve_lens,
+    write_sheet,
+)
 from companion.calibrate.pictures import PictureReader
 from companion.cli.commands import app
 from companion.config import load_config

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.errors import ConfigError
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 
 

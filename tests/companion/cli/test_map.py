@@ -126,7 +126,7 @@ def test_info_says_where_the_map_is_and_writes_its_outline(terrain, tmp_path):
     assert result.exit_code == 0
     assert "47.19" in result.output
     assert "EGM96 there: 47.75" in result.output
-    refused = run("info", terrain.path, "--kml", "/dev/full")
+    refused = run("info", terrain.path, "--kml", tmp_path / "area.txt")
     assert "--kml" in str(refused.exception)
     missing = run("info", terrain.path, "--geojson", tmp_path / "none" / "area.geojson")
     assert re.search("--geojson .*no such folder", str(missing.exception))

@@ -13,7 +13,7 @@ pytest.importorskip("pystac")
 from companion.cli.commands import app
 from localizer.geometry.geoid import geoid_separation
 from localizer.map.cache.cache import TileCache
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface
 from localizer.map.fetch.catalogue import load_sources
 from localizer.map.fetch.cloud import CloudFile
 from tests.localizer.map.fetch.loopback import (

@@ -22,8 +22,8 @@ from companion.targets.reporter import TargetReporter
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
+from localizer.map.cache.pick import MapSurface
 from localizer.map.cache.stream import TileStreamer
-from localizer.map.cache.surface import MapSurface
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import DOWN
 from localizer.types import Frame, PoseEstimate, ReferenceBundle, RegistrationStatus, TrackingState

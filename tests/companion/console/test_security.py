@@ -26,12 +26,12 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 from uvicorn.server import ServerState
 
+from companion.console.pictures import TileName
 from companion.console.records import Records
 from companion.console.security import MOST_BODY, RequestGuard, read_token
 from companion.console.server import ConsoleSite, make_application
 from companion.console.serving import RequestTimeoutProtocol, Server
 from companion.console.source import Newest
-from companion.console.tiles import TileName
 from companion.errors import ConfigError
 from companion.live.config import ConsoleConfig
 

@@ -16,10 +16,9 @@ import yaml
 from companion.calibration_watch.map_offset import MapOffsetEstimator
 from companion.config import load_config, parse_config
 from companion.conversions import CameraExtrinsics
-from companion.flight.channels import Channel, Feed
+from companion.flight.channels import Channel, Feed, FixInjection
 from companion.flight.component_table import COMPONENTS
 from companion.flight.components import Assembly, Component
-from companion.flight.injection import FixInjection
 from companion.inertial import InertialTrack
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
 from mavlink_bridge.bridge import Bridge

@@ -14,8 +14,8 @@ import pytest
 from companion.calibration_watch.observation import CalibrationObservation
 from companion.conversions import CameraExtrinsics, camera_view, vision_fix
 from companion.flight.calibration_observer import CalibrationObserver, middle_depth_m
-from companion.flight.injection import FixInjection
-from companion.flight.view_reporter import ViewReporter
+from companion.flight.channels import FixInjection
+from companion.ground.vital_signs import ViewReporter
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler

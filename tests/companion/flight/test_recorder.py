@@ -24,7 +24,7 @@ from companion.flight.recorder import (
     remove_empty,
     write_manifest,
 )
-from companion.offline.tables import poses, read_columns
+from companion.offline.record import poses, read_columns
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp

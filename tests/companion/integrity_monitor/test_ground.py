@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from companion.calibration_watch.ground import GroundView
-from companion.calibration_watch.observation import CalibrationObservation
+from companion.calibration_watch.observation import CalibrationObservation, GroundView
 from companion.integrity_monitor.config import ProtectionConfig
 from companion.integrity_monitor.protection import ProtectionLevel, protection_level
 from mavlink_bridge.alerts.ids import AlertId

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.integrity_monitor.position_checks import TiltCheck
 from companion.integrity_monitor.step import UNREPORTED_JUMP_M
-from companion.integrity_monitor.tilt import TiltCheck
 from mavlink_bridge.alerts.catalogue import cleared
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix

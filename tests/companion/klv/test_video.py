@@ -25,7 +25,7 @@ from companion.klv.metadata import KlvContext, frame_fields
 from companion.klv.relay import KlvRelay
 from companion.reporting.klv_recording import describe_recording
 from companion.sources import SourceSettings, VideoFileSource
-from companion.sources.misp import MispTime, sei_nal
+from companion.sources.timing import MispTime, sei_nal
 from companion.targets.target_manager import TargetEstimate
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame

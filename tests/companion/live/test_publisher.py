@@ -14,19 +14,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.console.flight_source import FlightSource
+from companion.console.source import FlightSource
 from companion.errors import CompanionError
 from companion.live.orders import OrderContext, OrderError, Orders
-from companion.live.protocol import LinkError, MessageDecoder, encode, runtime_folder, socket_path
+from companion.live.protocol import (
+    LinkError,
+    MessageDecoder,
+    SharedMemoryReader,
+    encode,
+    runtime_folder,
+    socket_path,
+)
 from companion.live.publisher import Publisher, RateLimiter
-from companion.live.shared import SharedMemoryReader
 from companion.live.shown import ConsoleData, Instruments
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import Frame
 from mavlink_bridge.alerts.catalogue import alert, body
 from mavlink_bridge.alerts.ids import AlertId
-from mavlink_bridge.injection.closed_loop import LoopVerdict
+from mavlink_bridge.injection.outcome import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
 from tests.companion.estimates import CAMERA, estimated

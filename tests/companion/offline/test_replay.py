@@ -18,15 +18,14 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.record import load_record, read_record
-from companion.offline.replay import replay, summarize
+from companion.offline.replay import RecordedAutopilot, replay, summarize
 from companion.reporting.pictures import map_pictures
 from companion.sources.zoom import ZoomTable
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.engine import DualThreadEngine
 from mavlink_bridge.link.tlog import read_tlog

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import MissionFileError
 from companion.geometry import Mount
-from companion.planning.flown import flown_legs, flown_words
 from companion.planning.mission import HeightAbove, read_mission
 from companion.planning.plan import alternatives_at
 from companion.planning.verdicts import (
@@ -21,14 +20,14 @@ from companion.planning.verdicts import (
     MissionLimits,
     Reason,
     SampleVerdict,
+    flown_legs,
+    flown_words,
     sample_verdict,
     stretches,
 )
 from companion.planning.way import Aim, MapHeights, camera_pose, legs_of
 from companion.preflight.map_pin import map_hash
-from localizer.forecast.forecast import ViewForecast
-from localizer.forecast.risk import Figures
-from localizer.forecast.rivals import AmbiguousPosition
+from localizer.forecast.forecast import AmbiguousPosition, Figures, ViewForecast
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import OdometryConfig
 from tests.localizer.map.conftest import height

@@ -10,7 +10,7 @@ from companion.preflight.doctor import examine_deployment
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.vehicle.mission import MissionWaypoint
 from sitl.geodesy import Location
-from sitl.ground.mission_steps import takeoff_step, waypoint_step
+from sitl.ground.mission_client import takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
 

@@ -12,7 +12,7 @@ import pytest
 
 from companion.config import parse_config
 from companion.preflight.coverage import check_origin, check_vehicle_position
-from companion.preflight.meanings import check_plausibility, check_ports
+from companion.preflight.doctor import check_plausibility, check_ports
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import VehicleState

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from companion.config import parse_config
-from companion.preflight.heights import check_heights
-from companion.preflight.places import check_places
+from companion.preflight.coverage import check_heights
+from companion.preflight.doctor import check_places
 from localizer.geometry.geo import Geodetic, LocalFrame
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.messages import VehicleState

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import CompanionConfig, load_config
 from companion.errors import ReportError
-from companion.preflight import bench, self_test
+from companion.preflight import self_test
 from companion.preflight.map_pin import map_hash
+from companion.preflight.self_test import STAGES, StageTime, stage_times
 from companion.preflight.sheet import as_html, as_text, make_sheet, write_sheet
-from companion.preflight.stages import STAGES, StageTime, stage_times
 from localizer.config import LocalizerConfig
 from localizer.features.extractor import load_extractor
 from localizer.map.cache.cache import MANIFEST_NAME
@@ -140,7 +140,7 @@ def switch_interval():
 def test_a_flight_over_the_made_map_is_timed(tmp_path, switch_interval):
     config = LocalizerConfig(width=64, threads=1)
     pose, frame = self_test.render_view(self_test.generate_map(tmp_path), config)
-    (row,) = bench.bench(tmp_path / "map", pose, frame.camera, config, (60,), 0.25)
+    (row,) = self_test.bench(tmp_path / "map", pose, frame.camera, config, (60,), 0.25)
     assert row.offered_hz == 60
     assert 0 < row.answered_hz < 200
     assert 0 < row.p50_ms <= row.p95_ms
@@ -166,7 +166,9 @@ def test_every_stage_is_timed_and_the_odometry_goes_on(tmp_path):
 
 
 def test_the_table_and_the_file_hold_every_rate(tmp_path, monkeypatch):
-    rows = [bench.BenchRow(hz, hz - 1.0, 20.0, 31.0, 22.5, 0.7, 512.0) for hz in bench.RATES_HZ]
+    rows = [
+        self_test.BenchRow(hz, hz - 1.0, 20.0, 31.0, 22.5, 0.7, 512.0) for hz in self_test.RATES_HZ
+    ]
     stages = [StageTime(w, name, w / 100, w / 64) for w in (320, 640) for name in STAGES]
     report = self_test.SelfTestReport(0.01, 0.02, 30.0, 4.0, "tiny (onnxruntime, CPU) + detail")
 

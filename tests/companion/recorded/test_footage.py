@@ -16,7 +16,7 @@ from companion.recorded.footage import FootageOptions, read_footage
 from companion.recorded.sequence import load_sequence, sequence_of
 from localizer.errors import SequenceError
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.geometry.posefile import pose_row, write_poses
+from localizer.geometry.trajectory import pose_row, write_poses
 from tests.companion.recorded.logs import UTC_S, swaying, write_dataflash, write_tlog
 from tests.companion.recorded.photos import dji, write_photo
 

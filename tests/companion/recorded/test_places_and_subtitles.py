@@ -6,7 +6,7 @@ import pytest
 from companion.errors import FootageError
 from companion.recorded.flight import Datum, Track
 from companion.recorded.places_file import read_places
-from companion.recorded.subtitles import read_subtitles
+from companion.recorded.video import read_subtitles
 
 
 @pytest.mark.parametrize(

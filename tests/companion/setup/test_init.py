@@ -16,8 +16,7 @@ from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
 from companion.settings_file import settable_fields
-from companion.setup.reference import reference
-from companion.setup.write import differing_settings
+from companion.setup.write import differing_settings, reference
 from localizer.errors import MapCacheError
 from tests.companion.test_config import DEPLOYMENT, MINIMAL, MODEL
 

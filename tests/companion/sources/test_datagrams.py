@@ -18,8 +18,7 @@ from companion.sources.datagrams import (
     VideoDatagrams,
     parse_sender,
 )
-from companion.sources.rtp import RtpDepacketizer, video_format
-from companion.sources.sdp import SdpSession
+from companion.sources.rtp import RtpDepacketizer, SdpSession, video_format
 
 S = 1_000_000_000
 TS = (b"\x47" + bytes(187)) * 7

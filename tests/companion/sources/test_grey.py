@@ -13,7 +13,7 @@ from PIL import Image as PillowImage
 from pydantic import ValidationError
 
 from companion.errors import StreamDecodeError, StreamDepthError
-from companion.setup.asking import read_stream_size
+from companion.setup.write import read_stream_size
 from companion.sources import SourceSettings, StreamState, av_source, open_source
 from companion.sources.folder_source import read_image
 from localizer.errors import GreyRangeError, SequenceError

@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
-from companion.sources.timing import ExposureClock, MinimumLag, Timing, system_minus_monotonic
+from companion.sources.timing import (
+    UUID,
+    ExposureClock,
+    MinimumLag,
+    MispTime,
+    Timing,
+    parse_message,
+    sei_nal,
+    system_minus_monotonic,
+)
 
 MS = 1_000_000
 

@@ -20,10 +20,8 @@ import pytest
 
 from companion.config import CompanionConfig, parse_config
 from companion.flight.channels import Feed
-from companion.supervision.processes import ENDING, Beat, FlightProcess
-from companion.supervision.pulse import Pulse, line
+from companion.supervision.processes import ENDING, Beat, FlightProcess, Pulse, ServiceManager, line
 from companion.supervision.restart import without_lost_disks, write_problem
-from companion.supervision.service_manager import ServiceManager
 from companion.supervision.supervisor import RestartPolicy, Supervisor, exit_code_text, mark_dead
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body

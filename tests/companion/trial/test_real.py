@@ -16,7 +16,7 @@ from companion.recorded.footage import FootageOptions, read_footage
 from companion.trial.result import trial_verdict
 from companion.trial.run import run_trial
 from localizer.geometry.camera import Camera
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache

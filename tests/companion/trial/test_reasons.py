@@ -21,9 +21,16 @@ from companion.recorded.flight import (
 )
 from companion.trial.localize import Localized
 from companion.trial.priors import Correction, priors_of
-from companion.trial.reasons import map_reason, reasons
-from companion.trial.result import NOT, UNKNOWN, WORKS, Trial, main_reason, trial_verdict
-from companion.trial.wanted_map import wanted_map
+from companion.trial.result import (
+    NOT,
+    UNKNOWN,
+    WORKS,
+    Trial,
+    main_reason,
+    trial_verdict,
+    wanted_map,
+)
+from companion.trial.run import map_reason, reasons
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache

@@ -25,7 +25,7 @@ from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.geometry.trajectory import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import Relocalizer
 from localizer.tracking.opening import MapStack, build_localizer

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from localizer.config import LocalizerConfig
-from localizer.evaluation.drawn_sensors import DrawnSensors
-from localizer.evaluation.metrics import localization_metrics
+from localizer.evaluation.places import DrawnSensors
 from localizer.evaluation.sequences import (
     EvaluatedFrame,
     Sequence,
     csv_rows,
     error_arrays,
+    localization_metrics,
     worst_first,
 )
 from localizer.geometry.camera import Camera

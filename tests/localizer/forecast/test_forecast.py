@@ -7,9 +7,15 @@ import pytest
 from localizer.config import LocalizerConfig
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
-from localizer.forecast.forecast import Forecaster, draw_prior
-from localizer.forecast.risk import RISK_LIMIT, Figures, failure_risk
-from localizer.forecast.visit import FORECAST_CONDITIONS, simulate_visit
+from localizer.forecast.forecast import (
+    FORECAST_CONDITIONS,
+    RISK_LIMIT,
+    Figures,
+    Forecaster,
+    draw_prior,
+    failure_risk,
+    simulate_visit,
+)
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.tile import TileMesh

@@ -13,8 +13,8 @@ from localizer.errors import GeoreferenceError
 from localizer.geometry.antimeridian import GeoBox, geo_box, lon_near, split_outline, wrapped
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.geoid import geoid_separation
-from localizer.map.inspection.footprint import as_geojson, as_kml
-from localizer.map.inspection.usable import usable_part
+from localizer.map.inspection.alignment import usable_part
+from localizer.map.inspection.inspect import as_geojson, as_kml
 
 A, F = 6378137.0, 1 / 298.257223563  # WGS84
 LATITUDE, LONGITUDE, HEIGHT = st.floats(-89.9, 89.9), st.floats(-179.9, 179.9), st.floats(-400, 9e3)

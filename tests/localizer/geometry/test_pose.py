@@ -24,8 +24,8 @@ from localizer.geometry.pose import (
     so3_exp,
     so3_log,
 )
-from localizer.geometry.posefile import pose_row, read_poses, world_from_camera, write_poses
 from localizer.geometry.shutter import Sweep
+from localizer.geometry.trajectory import pose_row, read_poses, world_from_camera, write_poses
 
 
 def vectors(limit):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from localizer.map.kind import UNKNOWN_HEIGHT_SIGMA_M, Heights, MapKind
-from localizer.map.relief import ground_uncertainty
+from localizer.map.terrain import ground_uncertainty
 from localizer.types import GroundUncertainty
 
 

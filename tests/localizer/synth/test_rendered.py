@@ -16,7 +16,7 @@ from localizer.synth.appearance.model import (
     apply_appearance,
     sample_appearance,
 )
-from localizer.synth.tiles.props import car_mesh
+from localizer.synth.tiles.vegetation import car_mesh
 
 NADIR = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # x east, y south, z down
 CAMERA = Camera.from_fov(320, 240, 60.0)

@@ -22,9 +22,13 @@ from localizer.synth.config import WorldConfig
 from localizer.synth.heightfield.render import render
 from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene
 from localizer.synth.plan.layout import plan_world
-from localizer.synth.plan.plan import WorldPlan
-from localizer.synth.visits.changes import Changes, apply_changes
-from localizer.synth.visits.visit import SurveyErrors, survey_and_flight_visits
+from localizer.synth.plan.planner import WorldPlan
+from localizer.synth.visits.visit import (
+    Changes,
+    SurveyErrors,
+    apply_changes,
+    survey_and_flight_visits,
+)
 from localizer.synth.world import WorldInfo, build_world
 
 TERRAIN_FACES = 2 * 20 * 20  # of a leaf, first in its face list

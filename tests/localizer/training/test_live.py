@@ -11,7 +11,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra `train`")
 
 from localizer.training.config import LiveSection, TrainConfig, load_config  # noqa: E402
-from localizer.training.data.live import LiveStream  # noqa: E402
+from localizer.training.data.batches import LiveStream  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
 from localizer.training.models.s0 import S0Config  # noqa: E402
 

@@ -18,7 +18,7 @@ from localizer.training.data.pairs import (
     survey_scene,
 )
 from localizer.training.data.shards import read_shard, write_shard, write_shards
-from localizer.training.places.photos import PhotoLibrary
+from localizer.training.places.land import PhotoLibrary
 from localizer.types import Float32
 
 SMALL = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from localizer.synth.heightfield.scene import Land, LitScene, Prism, SkyLight, compose, light_scene
-from localizer.synth.visits.texture import with_new_texture
-from localizer.training.places.changes import coarse_mesh
+from localizer.synth.visits.visit import with_new_texture
+from localizer.training.places.objects import coarse_mesh
 
 N, CELL = 256, 0.3
 

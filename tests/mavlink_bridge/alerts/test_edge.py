@@ -28,9 +28,9 @@ PARSES = {  # methods of a text, and of `re`
 }  # fmt: skip
 OUTSIDE = {  # why a value is a `Name` and none of a closed list
     "mavlink_bridge/bridge.py": "the system's error",
-    "mavlink_bridge/ground.py": "an address",
+    "mavlink_bridge/components.py": "an address",
     "mavlink_bridge/vehicle/unexpected_senders.py": "an address",
-    "mavlink_bridge/injection/fix_warnings.py": "a MAVLink message of the configuration",
+    "mavlink_bridge/injection/fix_sender.py": "a MAVLink message of the configuration",
     "companion/flight/component_table.py": "an address",
     "companion/integrity_monitor/integrity_monitor.py": "a thread",
     "companion/supervision/supervisor.py": "a thread, or a signal",

@@ -285,7 +285,7 @@ def test_gross_difference_is_refused_however_slowly_it_came() -> None:
 @pytest.mark.parametrize(("memory_s", "taken"), [(60.0, True), (2.0, False)])
 def test_gyros_are_trusted_over_a_dropout_and_not_over_a_long_one(monkeypatch, memory_s, taken):
     """They drift: what they say of a minute ago is no evidence against the autopilot's yaw."""
-    monkeypatch.setattr("mavlink_bridge.injection.yaw_guard._MEMORY_S", memory_s)
+    monkeypatch.setattr("mavlink_bridge.injection.injector._MEMORY_S", memory_s)
     it = injector(rate_hz=10, delay_ms=0)
     where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
 

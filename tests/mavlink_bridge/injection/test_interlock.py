@@ -18,10 +18,9 @@ from mavlink_bridge.config import (
     SourceSwitchConfig,
 )
 from mavlink_bridge.injection.injection_enable import InjectionEnable
-from mavlink_bridge.injection.interlock import ShadowInterlock
-from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.injection.shadow import ShadowInterlock, ShadowScore
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from tests.mavlink_bridge.simulated import SECOND, Flight
 
 SWITCH = SourceSwitchConfig(enabled=True)

@@ -19,14 +19,14 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.words import RcChannel
 from mavlink_bridge.config import InjectionConfig, InjectionEnableConfig, SourceSwitchConfig
 from mavlink_bridge.gnss_return import GnssReturnCheck
-from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
-from mavlink_bridge.injection.fix_warnings import FixWarnings
+from mavlink_bridge.injection.fix_sender import FixWarnings
 from mavlink_bridge.injection.injection_enable import InjectionEnable
+from mavlink_bridge.injection.outcome import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.injection.shadow import ShadowScore, ShadowScorer
 from mavlink_bridge.injection.switching import SourceSwitch
 from mavlink_bridge.messages import VehicleState
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.profile import ARDUPILOT, GENERIC, FirmwareProfile
 from tests.mavlink_bridge.simulated import HOME, METRE, MS, SECOND
 

@@ -20,7 +20,7 @@ from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.preflight.rules import ardupilot_rules, find_source_set, missing_feature
 from mavlink_bridge.vehicle.profile import select_profile
 from sitl.geodesy import Location
-from sitl.vehicles.ardupilot import ArduPilotSitl
+from sitl.vehicles.launch import ArduPilotSitl
 from tests.mavlink_bridge.simulated import GEOID, HOME, METRE, MS, SECOND, Flight
 
 COMMAND = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE

@@ -24,8 +24,7 @@ from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.ardupilot import ArduPilotSitl
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
+from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl, vision_only_parameters
 
 PROGRAM = shutil.which(os.environ.get("MAVPROXY", "mavproxy.py"))
 HOME = Location(47.397742, 8.545594, 488.0)

@@ -27,8 +27,7 @@ from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.ardupilot import ArduPilotSitl
-from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
+from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl, vision_only_parameters
 
 PROMISED = (
     "CAMERA_TRACKING_GEO_STATUS",

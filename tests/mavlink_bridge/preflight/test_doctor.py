@@ -14,9 +14,9 @@ from mavlink_bridge.config import InjectionConfig, OriginConfig, SourceSwitchCon
 from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.preflight.client import ParameterClient, decode_value, encode_value
 from mavlink_bridge.preflight.doctor import check_parameters, examine, repair
 from mavlink_bridge.preflight.failsafes import failsafes, px4_failsafes
-from mavlink_bridge.preflight.parameters import ParameterClient, decode_value, encode_value
 from mavlink_bridge.preflight.rules import (
     DoctorFinding,
     ardupilot_rules,
@@ -190,7 +190,7 @@ def test_firmware_that_was_built_without_the_feature_names_the_build_option(
 def test_a_small_board_is_one_required_failure_and_no_list_of_missing_parameters(
     autopilot: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mavlink_bridge.preflight.parameters._ANSWER_S", 0.1)
+    monkeypatch.setattr("mavlink_bridge.preflight.client._ANSWER_S", 0.1)
     link = DoctorFinding("connection", "ardupilot", "a heartbeat", "", True, True)
     known = ([link], VehicleState(autopilot="ardupilot"))
     monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
@@ -295,7 +295,7 @@ def test_parameters_are_asked_of_one_vehicle_and_taken_from_its_autopilot(autopi
             assert client.read("A") == 1.0
         assert client.system == 1
         client.write("A", 2.0)
-        monkeypatch.setattr("mavlink_bridge.preflight.parameters._ANSWER_S", 0.2)
+        monkeypatch.setattr("mavlink_bridge.preflight.client._ANSWER_S", 0.2)
         assert client.read_known(("A", "NO_SUCH")) == {"A": 2.0}
         with pytest.raises(ParameterError, match="no such parameter"):
             client.write("NO_SUCH", 1.0)

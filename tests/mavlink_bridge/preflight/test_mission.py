@@ -10,13 +10,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError, MissionError
-from mavlink_bridge.preflight.mission import download_mission
+from mavlink_bridge.preflight.client import download_mission
 from mavlink_bridge.vehicle.mission import MissionWaypoint
 from sitl.geodesy import Location
-from sitl.ground.mission_steps import MissionStep, takeoff_step, waypoint_step
+from sitl.ground.mission_client import MissionStep, takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot
-from sitl.vehicles.ardupilot import ArduPilotSitl
-from sitl.vehicles.launch import EmbeddedSitl
+from sitl.vehicles.launch import ArduPilotSitl, EmbeddedSitl
 
 HOME = Location(47.397742, 8.545594, 488.0)
 RELATIVE = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
@@ -30,7 +29,7 @@ ITEMS = [
     (19, RELATIVE, 474000000, 85500000),
 ]
 NOT_ON_EARTH = [*ITEMS[:2], (16, RELATIVE, 1_740_000_000, 85455940)]
-MISSION = "mavlink_bridge.preflight.mission"
+MISSION = "mavlink_bridge.preflight.client"
 
 
 def config(connection: str) -> BridgeConfig:
@@ -114,7 +113,7 @@ def test_places_of_the_mission(with_mission: Callable[..., Any], monkeypatch) ->
     ("how", "changed", "why"),
     [
         ({"refused": mavlink.MAV_MISSION_DENIED}, {}, "number of items .*MAV_MISSION_RESULT 14"),
-        ({"silent": True}, {f"{MISSION}._ANSWER_S": 0.1}, "number of items .*sil"),
+        ({"silent": True}, {f"{MISSION}._ITEM_ANSWER_S": 0.1}, "number of items .*sil"),
         ({}, {f"{MISSION}._LONGEST_S": -1.0}, "gave 0 of 6 items"),
         ({}, {f"{__name__}.ITEMS": NOT_ON_EARTH}, r"item 2 .* 174, 8\.54559 degrees"),
     ],

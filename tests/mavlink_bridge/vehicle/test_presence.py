@@ -20,7 +20,7 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
 from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
 from mavlink_bridge.status import OperatorStatus
-from mavlink_bridge.vehicle.presence import VehicleWatch
+from mavlink_bridge.vehicle_events import VehicleWatch
 from tests.mavlink_bridge.simulated import lengths
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)

@@ -19,7 +19,7 @@ from mavlink_bridge.alerts.catalogue import alert
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.config import BridgeConfig, CameraConfig, OriginConfig
 from mavlink_bridge.messages import Origin
-from mavlink_bridge.status_notifier import StatusNotifier
+from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
 from mavlink_bridge.vehicle.tracker import VehicleTracker

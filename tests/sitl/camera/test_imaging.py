@@ -13,11 +13,10 @@ import pytest
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp, so3_log
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
-from sitl.camera.distortion import RenderedLens, row_motion
 from sitl.camera.faults import PictureFault, VideoFaultInjector
-from sitl.camera.imaging import Sensor
 from sitl.camera.realism import CameraClock, CameraRealism, Vibration
 from sitl.camera.stream import LossyLink
+from sitl.camera.world_camera import RenderedLens, Sensor, row_motion
 
 
 def _scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -17,10 +17,8 @@ from localizer.geometry.pose import Pose, matrix_from_euler, quaternion_from_mat
 from localizer.map.cache.tile import TileMesh
 from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
-from sitl.camera.gimbal_error import GimbalError
-from sitl.camera.movers import Mover
-from sitl.camera.pose_sender import truth_feed
-from sitl.camera.traffic import traffic
+from sitl.camera.movers import Mover, traffic
+from sitl.camera.pose_sender import GimbalError, truth_feed
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 from sitl.errors import SimulationError
 from sitl.geodesy import Location

@@ -15,7 +15,7 @@ import trimesh
 from PIL import Image as PilImage
 
 from companion.geometry import GimbalAngles
-from companion.offline.tables import poses, read_columns
+from companion.offline.record import poses, read_columns
 from companion.sources import SourceSettings, StreamState, open_source
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame

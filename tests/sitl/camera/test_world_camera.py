@@ -13,25 +13,23 @@ import numpy as np
 import pytest
 
 from companion.geometry import GimbalAngles, Mount, camera_attitude, world_from_camera
-from companion.offline.tables import poses, read_columns
+from companion.offline.record import poses, read_columns
 from companion.sources import open_source
 from companion.sources.zoom import ZoomTable, with_focal_factor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, matrix_from_quaternion, so3_exp
-from localizer.geometry.posefile import read_poses
-from localizer.geometry.posefile import world_from_camera as pose_of_row
-from localizer.geometry.trajectory import read_tum
+from localizer.geometry.trajectory import read_poses, read_tum
+from localizer.geometry.trajectory import world_from_camera as pose_of_row
 from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from sitl.camera.detector import Detector, DetectorErrors, DetectorView, FixedPoint
-from sitl.camera.distortion import RenderedLens
 from sitl.camera.movers import Mover
 from sitl.camera.true_motion import PoseTrack
-from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera, centre_flow
+from sitl.camera.world_camera import CameraOptions, FrameLog, RenderedLens, WorldCamera, centre_flow
 from sitl.camera.zoom import Zooming, ZoomLens, level_of
-from sitl.demo.sequence import record_sequence
+from sitl.demo.kinematic import record_sequence
 from sitl.suite.loop.case import load_loop_cases
 
 CAMERA = Camera(320, 240, 230.0, 232.0, 163.0, 118.0, (-0.12, 0.03, 0.002, -0.001, -0.004))

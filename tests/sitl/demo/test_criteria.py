@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.reporting.verdicts import advice, value_and_limit
-from localizer.evaluation.metrics import LocalizationMetrics
+from companion.reporting.content import advice, value_and_limit
+from localizer.evaluation.sequences import LocalizationMetrics
 from localizer.geometry.pose import Pose, quaternion_from_matrix, so3_exp
 from sitl.demo.analysis import (
     Spread,
@@ -16,7 +16,7 @@ from sitl.demo.analysis import (
     target_errors,
     targets_inside,
 )
-from sitl.demo.criteria import ComputingRates, FlightFigures, check_criteria, headline
+from sitl.demo.report import ComputingRates, FlightFigures, check_criteria, headline
 
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 

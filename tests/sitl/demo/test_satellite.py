@@ -13,7 +13,7 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import object_mask
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.topview import TopView, render_top_view
-from sitl.demo.satellite import build_satellite_map
+from sitl.demo.assets import build_satellite_map
 from sitl.demo.scenario import SatelliteMap
 
 GSD_M, SIDE_PX, REACH_PX = 0.5, 640, 40

@@ -11,7 +11,6 @@ from localizer.synth.world import WorldInfo
 from sitl.camera.detector import DetectorErrors
 from sitl.camera.realism import CameraRealism
 from sitl.demo import assets
-from sitl.demo.budget import draw_errors
 from sitl.demo.kinematic import camera_path
 from sitl.demo.scenario import (
     CameraSpec,
@@ -19,6 +18,7 @@ from sitl.demo.scenario import (
     ScenarioError,
     ScenarioLeg,
     check_inside,
+    draw_errors,
     load_scenario,
 )
 from sitl.demo.script import mission

@@ -12,11 +12,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.control.mode import Mode
-from sitl.embedded.ekf.timesync import JitterCorrection
-from sitl.embedded.mavlink.server import MavlinkServer
-from sitl.embedded.parameters import Parameters
+from sitl.embedded.mavlink.server import JitterCorrection, MavlinkServer
+from sitl.embedded.parameters import Parameters, Px4Parameters
 from sitl.embedded.physics.rotation import euler
-from sitl.embedded.px4_parameters import Px4Parameters
 from sitl.embedded.vehicle import EmbeddedVehicle
 from sitl.geodesy import Location
 

@@ -14,7 +14,7 @@ from sitl.embedded.ekf.aided_filter import Aiding
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.ekf.injection import ExternalNavInput
 from sitl.embedded.ekf.measurements import Baro, ExternalPosition, ExternalVelocity, GpsData
-from sitl.embedded.ekf.timesync import JitterCorrection
+from sitl.embedded.mavlink.server import JitterCorrection
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics import dynamics
 from sitl.embedded.physics.dynamics import GRAVITY, MASS

@@ -15,12 +15,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.__main__ import main
 from sitl.embedded.control.mission import MissionStore
-from sitl.embedded.errors import ParameterFileError, PortError
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters, read_parameter_file
 from sitl.embedded.physics.gimbal import Gimbal
 from sitl.embedded.physics.rotation import euler
 from sitl.embedded.vehicle import EmbeddedVehicle
+from sitl.errors import ParameterFileError, PortError
 from sitl.geodesy import Location
 
 HERE = Location(47.0, 8.0, 500.0)

@@ -12,8 +12,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.control.mode import Mode
+from sitl.embedded.parameters import Px4Parameters
 from sitl.embedded.physics.rotation import quaternion
-from sitl.embedded.px4_parameters import Px4Parameters
 from sitl.geodesy import Location
 
 HOME = Location(47.397742, 8.545594, 488.0)

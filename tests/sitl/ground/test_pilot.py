@@ -20,7 +20,7 @@ import pytest
 from mavlink_bridge.link.link import sleep_until
 from sitl.errors import PilotError
 from sitl.geodesy import Location
-from sitl.ground.mission_steps import (
+from sitl.ground.mission_client import (
     gimbal_step,
     return_step,
     speed_step,
@@ -29,9 +29,17 @@ from sitl.ground.mission_steps import (
 )
 from sitl.ground.pilot import Pilot
 from sitl.ground.tracks import LeastLatencyClock, SampleTrack
-from sitl.vehicles import ardupilot, process
-from sitl.vehicles.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import GIMBAL, SPEEDS, EmbeddedSitl, VehicleSetup, open_vehicle
+from sitl.vehicles import launch, process
+from sitl.vehicles.launch import (
+    GIMBAL,
+    SPEEDS,
+    ArduPilotNotFoundError,
+    ArduPilotSitl,
+    EmbeddedSitl,
+    VehicleSetup,
+    find_arducopter,
+    open_vehicle,
+)
 from sitl.vehicles.process import VehicleProcess, VehicleProcessError
 
 HOME = Location(47.397742, 8.545594, 488.0)
@@ -190,7 +198,7 @@ def test_finds_binary_and_defaults_in_a_source_tree(monkeypatch, tmp_path):
     binary.chmod(0o755)
     monkeypatch.setenv("ARDUPILOT_HOME", str(tmp_path))
     assert find_arducopter() == binary
-    assert ardupilot.find_defaults(binary) == defaults
+    assert launch.find_defaults(binary) == defaults
 
 
 # --- flights, of either vehicle ------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.ground.statustext import TextLog
+from sitl.ground.vehicle_record import TextLog
 
 LONG = "not sent: vision yaw differs from the autopilot's by +5.1 deg, and this line goes on"
 

@@ -14,9 +14,8 @@ from localizer.geometry.camera import Camera
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
 from sitl.errors import SimulationError
-from sitl.operator.chase import SPEED_MPS, Chase, make_chase, pursuit
-from sitl.operator.followed import FollowedFix, follow_verdict
-from sitl.operator.pursuer import Pursuer
+from sitl.operator.follow_run import FollowedFix, follow_verdict
+from sitl.operator.pursuer import SPEED_MPS, Chase, Pursuer, make_chase, pursuit
 
 SECOND = 10**9
 CAMERA = Camera.from_fov(320, 240, 60.0)

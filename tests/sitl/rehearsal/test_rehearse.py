@@ -8,9 +8,8 @@ import pytest
 
 from localizer.map.cache.cache import TileCache
 from sitl.demo.assets import FlightAssets
-from sitl.demo.flight import home_of
+from sitl.demo.flight import home_of, observed_targets
 from sitl.demo.scenario import Scenario, ScenarioError
-from sitl.demo.targets import observed_targets
 from sitl.rehearsal.rehearse import read_mission, rehearse
 
 

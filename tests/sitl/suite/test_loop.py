@@ -25,15 +25,19 @@ from sitl.suite.loop.case import Expectation, LoopCase, load_loop_cases
 from sitl.suite.loop.evaluation import (
     LoopExpectationResult,
     LoopRecord,
+    LoopRow,
     LoopSample,
     RestartTimes,
+    as_data,
     evaluate,
+    false_alarm_rate,
     false_alarms,
     figures,
     longest_unreported_s,
+    markdown,
+    read_rows,
     standing_alerts,
 )
-from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown, read_rows
 from sitl.suite.loop.runner import RunOptions, fly_loop, parse_seeds
 from sitl.suite.record import Text
 

@@ -21,8 +21,7 @@ from sitl.suite.case import SCENARIOS, Case, load_case, load_cases
 from sitl.suite.checks import Check
 from sitl.suite.flight import bridge_config, longest_stall, slowest_pace
 from sitl.suite.record import CaseRecord, Doctor, Text, VehicleSample
-from sitl.suite.report import markdown, summary, write_report
-from sitl.suite.runner import ReportRow, evaluate
+from sitl.suite.runner import ReportRow, evaluate, markdown, summary, write_report
 
 SHIPPED = load_cases()
 

@@ -8,7 +8,7 @@ import pytest
 from localizer.errors import MapSourceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
-from localizer.map.building import levels, quadtree
+from localizer.map.building import quadtree, sources
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.tiles3d import ContentFile
 from localizer.map.inspection.inspect import verify
@@ -88,8 +88,8 @@ def test_a_bad_tile_costs_only_itself(flat, build):
 
 
 def test_a_huge_leaf_is_cut(make, tmp_path, build, monkeypatch):
-    monkeypatch.setattr(levels, "_SMALL_BYTES", 1000)
-    monkeypatch.setattr(levels, "MAX_TRIANGLES", 5000)
+    monkeypatch.setattr(sources, "_SMALL_BYTES", 1000)
+    monkeypatch.setattr(sources, "MAX_TRIANGLES", 5000)
     monkeypatch.setattr(quadtree, "LEAF_TRIANGLES", 1000)
     folder = tmp_path / "s"
     folder.mkdir()

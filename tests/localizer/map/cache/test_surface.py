@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localizer.map.cache.pick import cast_bundle, cast_rays
-from localizer.map.cache.surface import MapSurface
+from localizer.map.cache.pick import MapSurface, cast_bundle, cast_rays
 from tests.localizer.map.conftest import leaf_meshes
 
 EYE = np.array([-40.0, 30.0, 150.0])

@@ -15,7 +15,7 @@ from localizer.map.fetch.area import Area, area_around
 from localizer.map.fetch.catalogue import CatalogueSource, choose, load_sources
 from localizer.map.fetch.cloud import degree_files
 from localizer.map.fetch.raster import FetchGrid
-from localizer.map.fetch.web_map import wms_url
+from localizer.map.fetch.tiles import wms_url
 from localizer.map.importers.height_crs import utm_zone
 
 BERN = area_around(np.array([[46.948, 7.447]]), 300.0)

@@ -6,8 +6,8 @@ import pytest
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
+from localizer.map.fetch.catalogue import require_allowed
 from localizer.map.fetch.http_client import HttpClient
-from localizer.map.fetch.terms import require_allowed
 from tests.localizer.map.fetch.loopback import serving
 
 

@@ -17,9 +17,8 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import CatalogueSource
 from localizer.map.fetch.cloud import CloudFile, plan_files
-from localizer.map.fetch.fetch import fetch, make_plan
+from localizer.map.fetch.fetch import check_piece, fetch, make_plan
 from localizer.map.fetch.http_client import HttpClient
-from localizer.map.fetch.mosaic import check_piece
 from localizer.map.fetch.raster import Piece
 from tests.localizer.map.fetch.loopback import (
     CRS,

@@ -24,8 +24,8 @@ from localizer.errors import GeoreferenceError, LocalizerError, MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.geoid import geoid_separation
 from localizer.map.building.build import build_cache
-from localizer.map.building.isolation import call_in_process
 from localizer.map.building.options import BuildOptions
+from localizer.map.building.workers import call_in_process
 from localizer.map.importers.georeference import Georeference, read_georeference
 from localizer.map.importers.raster_checks import check_heights
 from localizer.map.importers.raster_file import METRES, offline, open_raster, require_sane

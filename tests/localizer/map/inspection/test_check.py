@@ -15,10 +15,8 @@ from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.importers.rules import ImportRules
-from localizer.map.inspection.alignment import measure_alignment
+from localizer.map.inspection.alignment import Mosaic, measure_alignment, render_mosaic, usable_part
 from localizer.map.inspection.check import Grade, MapUse, check_map, find_seams
-from localizer.map.inspection.mosaic import Mosaic, render_mosaic
-from localizer.map.inspection.usable import usable_part
 from tests.localizer.map.conftest import write_tileset, write_tree
 
 FINE = MapUse(120.0, 0.004)
