@@ -41,7 +41,7 @@ def offset_m(survey: TopView, satellite: TopView, row: int, column: int, half: i
 
 
 def test_ground_stays_and_roofs_lean_away_from_the_satellite(small_assets, tmp_path, monkeypatch):
-    monkeypatch.setattr("sitl.demo.satellite.BuildOptions", partial(BuildOptions, workers=1))
+    monkeypatch.setattr("sitl.demo.assets.BuildOptions", partial(BuildOptions, workers=1))
     off_nadir_deg, azimuth_deg = 18.0, 240.0
     spec = SatelliteMap(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth_deg, blur_px=0.8)
     build_satellite_map(small_assets.world, small_assets.map_cache, spec, tmp_path / "map")
