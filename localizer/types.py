@@ -220,7 +220,7 @@ def _up() -> Array:
 class TargetSurface:
     """A surface that a target's pixel may show. probability: 0 to 1; position: (3,) world metres;
     covariance: (3, 3) m², world axes, given this surface; normal: (3,) unit, world axes;
-    repeats: (3, 3) m², the part of `covariance` that is alike in all frames of one view.
+    repeats: (3, 3) m², the part of `covariance` that is the same in all frames of one view.
     """
 
     probability: float

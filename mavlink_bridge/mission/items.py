@@ -1,4 +1,7 @@
-"""Items of a mission as MAVLink carries them: https://mavlink.io/en/services/mission.html"""
+"""Items of a mission as MAVLink carries them, and which change the flight path or the camera.
+
+https://mavlink.io/en/services/mission.html
+"""
 
 from __future__ import annotations
 
