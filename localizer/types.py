@@ -220,24 +220,14 @@ def _up() -> Array:
 class TargetSurface:
     """A surface that a target's pixel may show. probability: 0 to 1; position: (3,) world metres;
     covariance: (3, 3) m², world axes, given this surface; normal: (3,) unit, world axes;
-    roughness_m: deviation from its tangent plane.
+    repeats: (3, 3) m², the part of `covariance` that is alike in all frames of one view.
     """
 
     probability: float
     position: Array
     covariance: Array
     normal: Array = field(default_factory=_up)
-    roughness_m: float = 0.0
-
-
-@dataclass(frozen=True)
-class TargetSighting:
-    """A target's pixel and the surfaces (at least one) that it may show; time_ns: exposure."""
-
-    target_id: str
-    surfaces: tuple[TargetSurface, ...]
-    pixel: tuple[float, float]
-    time_ns: int
+    repeats: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 class Visibility(Enum):

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import hypothesis
@@ -21,11 +22,16 @@ import pytest
 os.environ["NUMBA_NRT_STATS"] = "1"  # before numba is imported: a test counts allocations
 
 from localizer.map.building.build import build_cache
-from sitl.demo.assets import FlightAssets, prepare
+from localizer.map.building.options import BuildOptions
+from localizer.map.cache.cache import TileCache
+from localizer.synth.world import build_visits
+from sitl.demo import assets
+from sitl.demo.assets import FlightAssets
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 from sitl.errors import SimulationError
 from sitl.vehicles.launch import find_arducopter
+from tests.localizer.map.conftest import write_tileset
 from tests.parts import PARTS, SHARED_FOLDER, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
@@ -78,10 +84,15 @@ def _alone_at(path: Path) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def small_assets(shared_folder: Path) -> FlightAssets:
-    """A 400 m world with both caches: 12 s of processor, so all tests share it."""
+    """A 400 m world with both caches, so all tests share it.
+
+    Made in this process: more than half of the time was that of others that started.
+    """
     worlds = shared_folder / "worlds"
-    with _alone_at(worlds):
-        return prepare(5, worlds, size_m=400.0, ideal=True)
+    with _alone_at(worlds), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assets, "build_visits", partial(build_visits, processes=1))
+        patch.setattr(assets, "build_cache", partial(build_cache, options=BuildOptions(workers=1)))
+        return assets.prepare(5, worlds, size_m=400.0, ideal=True)
 
 
 @pytest.fixture(scope="session")
@@ -92,6 +103,16 @@ def quito_map(real_data: Callable[[str], Path], shared_folder: Path) -> Path:
         if not cache.exists():
             build_cache(source, cache)
     return cache
+
+
+@pytest.fixture(scope="session")
+def terrain(shared_folder: Path) -> TileCache:
+    """The 21 tiles of `write_tileset` as a tile cache: nobody changes it, so all tests share it."""
+    folder = shared_folder / "terrain"
+    with _alone_at(folder):
+        if not (folder / "cache").exists():
+            build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
+    return TileCache.open(folder / "cache")
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.ground import TerrainModel
-from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.odometry import VisualOdometry
 from localizer.odometry.usability import find_fault
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
@@ -89,7 +89,7 @@ class Flyer:
         config: OdometryConfig,
     ) -> None:
         self._scene, self._extractor = scene, extractor
-        self._optimizer, self._config = odometry_optimizer(optimizer), config
+        self._optimizer, self._config = optimizer, config
 
     def fly(self, stretch: TestStretch, depths: tuple[str, ...]) -> list[FlownStretch]:
         """The stretch with each source of depth in `depths`, over the same pictures."""

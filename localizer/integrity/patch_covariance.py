@@ -46,13 +46,15 @@ def patch_covariance(
     if (inverse := scaled_inverse(normal)) is None:
         return None
     noise_px = max(patches.scatter_px, _LEAST_PX) / patches.matched
-    least = _RESIDUALS_SHARE * by_residuals
-    explained = float(np.einsum("ij,ji->", normal, least)) / 6
-    meat = max(noise_px**2 - explained, 0.0) * normal
+    # Along each axis of the image's motion the larger of the two variances.
+    root = np.linalg.cholesky(normal)
+    known, axes = np.linalg.eigh(root.T @ (_RESIDUALS_SHARE * by_residuals) @ root)
+    spread = np.linalg.solve(root.T, axes)
+    covariance = spread @ np.diag(np.maximum(known, noise_px**2)) @ spread.T
     if height_sigma_m > 0:
         pull = np.einsum("kai,ka->ki", patches.motion, patches.rise)
-        meat = meat + height_sigma_m**2 * pull.T @ height_correlation(patches.ground) @ pull
-    covariance = least + inverse @ meat @ inverse
+        meat = height_sigma_m**2 * pull.T @ height_correlation(patches.ground) @ pull
+        covariance = covariance + inverse @ meat @ inverse
     symmetric: Array = 0.5 * (covariance + covariance.T)
     return symmetric
 

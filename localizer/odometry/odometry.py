@@ -48,11 +48,10 @@ class VisualOdometry:
     milliseconds more for a new keyframe. Both belong to the localization thread. The odometry
     renders nothing and starts no thread.
 
-    camera: the working pinhole of features whose frame names none. optimizer: see
-    `odometry_optimizer`. ground: a terrain model for where the map has no geometry. Only its shape
-    is used: it is shifted vertically to the ground where the map was last seen. None: a plane at
-    the height measured by a rangefinder, else at the ground height where the map was last seen.
-    uncertainty: of that ground.
+    camera: the working pinhole of features whose frame names none. ground: a terrain model for
+    where the map has no geometry. Only its shape is used: it is shifted vertically to the ground
+    where the map was last seen. None: a plane at the height measured by a rangefinder, else at the
+    ground height where the map was last seen. uncertainty: of that ground.
 
     Above 200 lines: the path of one frame, from keyframe to estimate, over one state.
     """
@@ -330,12 +329,3 @@ class VisualOdometry:
             source=keyframe.source,
             scale_sigma=keyframe.scale,
         )  # fmt: skip
-
-
-def odometry_optimizer(optimizer: JNGO, threads: int = 2) -> JNGO:
-    """The map registration's optimizer, set up for odometry; it shares the backend.
-
-    Two frames of one flight show the same objects, so the covariance contains no error of the map.
-    """
-    config = replace(optimizer.config, map_error_m2=0.0)
-    return JNGO(config, optimizer.backend, threads)

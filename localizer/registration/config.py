@@ -47,7 +47,6 @@ class JNGOConfig:
     mode_px: float = 5.0  # least distance of another mode from the winner, level px
     covariance_floor: float = 0.05  # least share of the isotropic model
     shape_cells: float = 40.0  # cells that the noise's model shape counts for
-    map_error_m2: float = 0.13  # displacement of the map (sigma) times its correlation length
     max_sigma_m: float = 50.0  # position sigma that counts as no texture
 
     @property
@@ -63,7 +62,6 @@ class JNGOConfig:
             self.covariance_floor,
             self.few_anchors,
             self.shape_cells,
-            self.map_error_m2,
         )
 
     def swarm(self, prior: PosePrior, seed: int) -> tuple[Array, Array]:

@@ -27,8 +27,8 @@ class AnchorModel:
 
     projection: (N, 2, 6) of equation 6; structure: (N, 2, 2) and slope: (N, 2), S and b of equation
     7; squares: (N,) squared residual norms; weights: (N,) joint confidences; robust: (N,) the
-    loss's weights; cell: (N,) number of its image cell, from 0 on; cell_px: side of a cell in level
-    px; channels: C; prior_hessian: (6, 6).
+    loss's weights; cell: (N,) number of its image cell, from 0 on; channels: C; prior_hessian: (6,
+    6).
     """
 
     projection: Array
@@ -38,7 +38,6 @@ class AnchorModel:
     weights: Array
     robust: Array
     cell: NDArray[np.int64]
-    cell_px: float
     channels: int
     prior_hessian: Array
 
@@ -65,7 +64,6 @@ def anchor_model(
         problem.anchor_confidence[seen.anchor] * seen.confidence,
         robust_loss(np.sqrt(squares), settings)[1],
         _cells(seen.u, seen.v, cell_px),
-        cell_px,
         anchors.shape[1],
         prior_hessian,
     )
@@ -80,17 +78,16 @@ def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
 @dataclass(frozen=True)
 class CovarianceSums:
     """Sums of equation 11 over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior; meat:
-    Σ_cells F Fᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: number of occupied cells; cell_px:
-    their side in level px; prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi moves the
-    image by sqrt(xi' motion xi) level px, rms; anchors: number in view, of all that the pose was
-    fitted to; share: share of these that the sums contain; curvature: equation 11a.
+    Σ_cells F Fᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: number of occupied cells;
+    prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi moves the image by
+    sqrt(xi' motion xi) level px, rms; anchors: number in view, of all that the pose was fitted to;
+    share: share of these that the sums contain; curvature: equation 11a.
     """
 
     hessian: Array
     meat: Array
     isotropic: Array
     cells: int
-    cell_px: float
     prior_hessian: Array
     motion: Array
     anchors: int
@@ -119,7 +116,6 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
         per_cell.T @ per_cell,
         variance * (rows.T @ (share * information).reshape(-1, 6)),
         cells,
-        model.cell_px,
         model.prior_hessian,
         mean_motion(J),
         len(J),
@@ -159,15 +155,13 @@ class NoiseModel:
     that the sums do not contain (11b); floor: smallest share of the isotropic model, so that a
     perfect fit does not give a zero covariance; few_anchors: number of anchors in view at which the
     variance is doubled (11b); shape_cells: number of cells that count as much as the isotropic
-    model (11c); map_error: standard deviation of the map's displacement times its correlation
-    length, m² (11d).
+    model (11c).
     """
 
     correlation: float
     floor: float = 0.0
     few_anchors: float = 0.0
     shape_cells: float = 0.0
-    map_error: float = 0.0
 
 
 def sandwich_covariance(
@@ -185,11 +179,6 @@ def sandwich_covariance(
         return None
     factor = noise.correlation * sums.share * (1.0 + noise.few_anchors / max(sums.anchors, 1))
     meat = factor * (_shrunk_meat(sums, noise.shape_cells) + noise.floor * sums.isotropic)
-    if noise.map_error > 0:
-        displaced = _map_displacement(sums, noise.map_error)
-        if displaced is None:
-            return None
-        meat = meat + sums.curvature**2 * sums.hessian @ displaced @ sums.hessian
     covariance: Array = inverse @ (meat + prior_weight * sums.prior_hessian) @ inverse
     symmetric: Array = 0.5 * (covariance + covariance.T)
     return symmetric
@@ -205,19 +194,6 @@ def _shrunk_meat(sums: CovarianceSums, shape_cells: float) -> Array:
     ratio = float(np.einsum("ij,ji->", shape, meat)) / 6
     drawn: Array = (freedom * meat + shape_cells * ratio * sums.isotropic) / (freedom + shape_cells)
     return drawn
-
-
-def _map_displacement(sums: CovarianceSums, map_error: float) -> Array | None:
-    """Equation 11d: covariance (6, 6) of xi by displaced patches of the map; None if the anchors do
-    not determine a pose.
-    """
-    inverse = scaled_inverse(sums.motion)
-    if inverse is None:
-        return None
-    px_per_m = np.sqrt(0.5 * (sums.motion[0, 0] + sums.motion[1, 1]))
-    area = sums.cells * (sums.cell_px / px_per_m) ** 2
-    displaced: Array = (map_error * px_per_m) ** 2 / area * inverse
-    return displaced
 
 
 def pose_covariance(tangent: Array, rotation: Array, translation: Array) -> Array:

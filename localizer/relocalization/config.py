@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class RelocalizationConfig:
     """Effort of the search, and limits for its result."""
 
-    threads: int = 1  # CPU threads of a search
+    threads: int = 2  # CPU threads of a search, which runs while no position is known
     cache_mib: int = 128  # resident tiles, MiB
     spectra_mib: int = 256  # map transforms kept between searches, MiB
     # A patch of 130 m is blurred by two cells at its edge when it is turned by 3 degrees or scaled

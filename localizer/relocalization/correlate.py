@@ -133,8 +133,8 @@ class LevelCorrelator:
         patches: Sequence[PatchSpectra],
         pairs: Sequence[tuple[int, Block]],
         apart: int = ORIGIN_CELLS,
-    ) -> list[Float32]:
-        """Scores (n, n) of each pair: number of a patch, and the block. At most `PATCHES_TOGETHER`
+    ) -> Float32:
+        """Scores (m, n, n) of m pairs: number of a patch, and the block. At most `PATCHES_TOGETHER`
         patches and `BLOCKS_TOGETHER` different blocks, of one size. apart: cells between compared
         origins, `ORIGIN_CELLS` or `ROUGH_CELLS`.
         """
@@ -154,25 +154,20 @@ class LevelCorrelator:
         raws = scipy.fft.irfft(columns, n, axis=2, workers=1)
         below = np.stack([spectra[blocks[b]].energy * patches[k].mask.conj() for k, b in pairs])
         energies = scipy.fft.irfft2(below, (SIZE // _COARSE,) * 2, workers=1)
-        return [
-            self._normalised(raw, energy, patches[k])
-            for raw, energy, (k, _) in zip(raws, energies, pairs, strict=True)
-        ]
-
-    def _normalised(self, raw: Float32, energy: Float32, patch: PatchSpectra) -> Float32:
-        """Scores (side, side) of the raw ones (side, n)."""
-        side, n = raw.shape
-        least = max(_LEAST_ENERGY * self._usual * patch.weight * patch.cells**2, 1e-9)
-        scores = np.empty((side, side), np.float32)
-        norm = max(patch.norm, 1e-9) * (2 * _LOW / n) ** 2  # fewer frequencies: a smaller divisor
-        _normalised(raw, energy, np.float32(least), np.float32(norm), scores)
+        least = [max(_LEAST_ENERGY * self._usual * p.weight * p.cells**2, 1e-9) for p in patches]
+        # Fewer frequencies: a smaller divisor.
+        norm = [max(p.norm, 1e-9) * (2 * _LOW / n) ** 2 for p in patches]
+        of = [k for k, _ in pairs]
+        scores = np.empty((len(pairs), side, side), np.float32)
+        _normalised(raws, energies, np.float32(least)[of], np.float32(norm)[of], scores)
         return scores
 
     def warm_up(self) -> None:
         """Compile the kernels of a search."""
         channels = self.level.features.shape[0]
         patch = transform_patch(np.ones((8, 8, channels), np.float32), np.ones((8, 8), np.float32))
-        self.correlate(patch, self.blocks(patch.cells)[0])
+        scores = self.correlate(patch, self.blocks(patch.cells)[0])
+        mask_unsuited(scores[None], np.ones((1, 4, 4), np.bool_))
 
     def prepare(self, block: Block) -> _Spectra:
         """The block's spectra, from the cache or computed."""
@@ -247,17 +242,38 @@ def _multiplied(blocks, patches, pairs, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def _normalised(raw, energy, least, norm, out):  # type: ignore[no-untyped-def]
+def _normalised(raws, energies, least, norm, out):  # type: ignore[no-untyped-def]
     """Sample k of the coarse energy belongs to cell 8 k: between them it is interpolated."""
-    each = _COARSE * raw.shape[1] // SIZE
+    each = _COARSE * raws.shape[2] // SIZE
     step = np.float32(1.0 / each)
-    for i in range(out.shape[0]):
-        p = i // each
-        a = (i - p * each) * step
-        for q in range(out.shape[1] // each):
-            west = energy[p, q] + a * (energy[p + 1, q] - energy[p, q])
-            east = energy[p, q + 1] + a * (energy[p + 1, q + 1] - energy[p, q + 1])
-            slope = (east - west) * step
-            for b in range(each):
-                j = q * each + b
-                out[i, j] = raw[i, j] / (np.sqrt(max(west + b * slope, least)) * norm)
+    for m in range(out.shape[0]):
+        raw, energy = raws[m], energies[m]
+        for i in range(out.shape[1]):
+            p = i // each
+            a = (i - p * each) * step
+            for q in range(out.shape[2] // each):
+                west = energy[p, q] + a * (energy[p + 1, q] - energy[p, q])
+                east = energy[p, q + 1] + a * (energy[p + 1, q + 1] - energy[p, q + 1])
+                slope = (east - west) * step
+                for b in range(each):
+                    j = q * each + b
+                    out[m, i, j] = raw[i, j] / (np.sqrt(max(west + b * slope, least[m])) * norm[m])
+
+
+@njit(cache=True, nogil=True)
+def mask_unsuited(scores, suited):  # type: ignore[no-untyped-def]
+    """Set scores (m, n, n) to -1 where the suited cells (m, g, g) of n / g scores each, and one
+    score about them, for the last maxima are interpolated, too, do not reach.
+    """
+    n, cells = scores.shape[1], suited.shape[1]
+    side = n // cells
+    for m in range(scores.shape[0]):
+        for i in range(n):
+            above = suited[m, max(i - 1, 0) // side]
+            below = suited[m, min(i + 1, n - 1) // side]
+            reached = above | below
+            for q in range(cells):
+                if not reached[q]:
+                    first = q * side + (q > 0 and reached[q - 1])
+                    last = (q + 1) * side - (q + 1 < cells and reached[q + 1])
+                    scores[m, i, first:last] = -1

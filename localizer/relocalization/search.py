@@ -32,6 +32,7 @@ from localizer.relocalization.correlate import (
     ROUGH_CELLS,
     Block,
     LevelCorrelator,
+    mask_unsuited,
     transform_patch,
 )
 from localizer.relocalization.overview import (
@@ -387,7 +388,7 @@ class _MapSearch:
         trials = [trial for look in looks for trial in look.trials]
         pairs = []
         for p in self.compare(looks, [t.blocks for t in trials], ROUGH_CELLS, each):
-            at = int(np.argmax(p.scores))
+            at = int(p.scores.argmax())
             best = float(p.scores.flat[at])
             pairs.append(RoughPair(trials[p.trial], p.block, p.power, best, at))
         noise = trial_noise(trials, [(p.trial.number, p.power) for p in pairs])
@@ -410,16 +411,20 @@ class _MapSearch:
                 if trial.of.height_m == other.of.height_m:
                     noise[trial.number] = theirs[other.number]
         wanted: list[dict[Block, SuitedOrigins]] = [{} for _ in trials]
+        corners = np.array([(b.row, b.column) for b in self.blocks])
+        farthest = self.blocks[0].step + reach
         for pair in rough:
             corner = np.array([pair.block.row, pair.block.column])
             at = corner + ROUGH_CELLS * np.array(divmod(pair.at, pair.block.step // ROUGH_CELLS))
             place = strip.camera_at(at, pair.trial.of)
             # At every height, for the strip's middle may lie higher or lower than the frame.
             for trial in mine.get(pair.trial.of.heading_rad, ()):
-                found, origin = wanted[trial.number], self.origin_of(place, trial.of)
-                for block, suited in trial.blocks.items():
-                    row, column = origin[0] - block.row, origin[1] - block.column
-                    if min(row, column) < -reach or max(row, column) > block.step + reach:
+                found = wanted[trial.number]
+                away = self.origin_of(place, trial.of) - corners
+                for k in np.flatnonzero(((-reach <= away) & (away <= farthest)).all(axis=1)):
+                    block, (row, column) = self.blocks[k], away[k]
+                    suited = trial.blocks.get(block)
+                    if suited is None:
                         continue
                     middles = np.arange(GROUND_CELLS / 2, block.step, GROUND_CELLS)
                     near = np.outer(abs(middles - row) <= reach, abs(middles - column) <= reach)
@@ -487,10 +492,10 @@ class _MapSearch:
                     if b in wanted[trial.number]
                 ]  # fmt: skip
                 scores = self.correlator.correlate_all(patches, pairs, apart)
-                for (n, block), raw in zip(pairs, scores, strict=True):
-                    power = float(np.vdot(raw, raw)) / raw.size
-                    suited = wanted[some[n].number][block]
-                    masked = self.masked(raw, block, some[n].of, suited, apart)
+                powers = np.einsum("mij,mij->m", scores, scores) / scores[0].size
+                mask_unsuited(scores, np.stack([wanted[some[n].number][b].mask for n, b in pairs]))
+                for (n, block), power, masked in zip(pairs, powers.tolist(), scores, strict=True):
+                    self.mask_outside(masked, block, some[n].of, apart)
                     found.append(PairScores(some[n].number, block, power, masked))
         return found
 
@@ -559,21 +564,13 @@ class _MapSearch:
         mask = np.asarray((low <= height) & (height <= high))
         return SuitedOrigins(mask, float(np.isfinite(ground).mean()))
 
-    def masked(
-        self, scores: Float32, block: Block, of: Rectification, suited: SuitedOrigins, apart: int
-    ) -> Float32:
-        if not suited.mask.all():
-            side = GROUND_CELLS // apart
-            fine = suited.mask.astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
-            fine = cv2.dilate(fine, np.ones((3, 3)))  # the last maxima are interpolated, too
-            scores = np.where(fine, scores, np.float32(-1.0))
+    def mask_outside(self, scores: Float32, block: Block, of: Rectification, apart: int) -> None:
+        """Set scores of cameras outside the region to -1."""
         if self.query.region is not None:
             at = np.arange(0, block.step, apart)
             rows, columns = at + block.row, at + block.column
             grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
-            inside = self.query.region.contains(self.camera_at(grid, of))
-            scores = np.where(inside, scores, -1.0)
-        return scores.astype(np.float32, copy=False)
+            scores[~self.query.region.contains(self.camera_at(grid, of))] = -1.0
 
     def camera_at(self, origin: NDArray[Any], trial: Rectification) -> Array:
         """East and north (..., 2) of the camera whose patch begins at cell (..., 2)."""

@@ -32,6 +32,10 @@ _SMALLEST_STEP_M = 1.0
 # At grazing incidence the plane model explodes: 3 degrees is where we stop believing it.
 _MIN_COSINE = 0.05
 
+# The middle of what is rough, as a crown, is off by twice what its hits deviate: a variance.
+_ROUGH = 4.0
+_AIM = 0.2  # of a pixel's variance: a detector's aim is off alike in all frames of one view
+
 
 @dataclass(frozen=True)
 class RaySpread:
@@ -135,13 +139,13 @@ def locate(
         normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
         own = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)), drift)
         covariance = surface_covariance(offset, normal, own, map_sigma_m)
-        rough = float(share @ ((points - offset) @ normal) ** 2)
+        rough = _ROUGH * float(share @ ((points - offset) @ normal) ** 2)
         cosine = max(abs(float(normal @ d)), _MIN_COSINE)
         covariance += np.outer(d, d) * rough / cosine**2
+        view = replace(own, pixel=_AIM * own.pixel)
+        repeats = surface_covariance(offset, normal, view, 0.0)
         probability = float(weights[group].sum())
-        surfaces.append(
-            TargetSurface(probability, eye + offset, covariance, normal, float(np.sqrt(rough)))
-        )
+        surfaces.append(TargetSurface(probability, eye + offset, covariance, normal, repeats))
     total = sum(s.probability for s in surfaces)
     found = (replace(s, probability=s.probability / total) for s in surfaces)
     return tuple(sorted(found, key=lambda s: -s.probability))

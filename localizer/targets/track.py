@@ -1,8 +1,7 @@
 """Track of one target: static or moving; seen, held by geometry or hidden.
 
-An observation updates both a static (`StaticTarget`) and a moving hypothesis (`TargetFilter`). The
-target is static until its rays contradict that, and again after it has stood for a while. A
-velocity is reported only if motion was measured.
+`TargetFilter` estimates position and motion; a velocity is reported only if the target more
+probably moves. What is implausible (`limits`) is refused.
 """
 
 from __future__ import annotations
@@ -24,19 +23,14 @@ from localizer.targets.limits import (
 )
 from localizer.targets.locate import (
     RayCaster,
+    RaySpread,
     locate,
     ray_in_world,
     ray_spread,
     surface_covariance,
 )
-from localizer.targets.static import ObservedRay, StaticTarget
-from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
+from localizer.types import PoseEstimate, TargetFix, TargetSurface, Visibility
 
-_STANDS_S = 2.0  # for so long it must agree with standing before it stands again
-_STANDS_MPS = 1.0
-_GAP_S = 5.0  # a moving target unseen for so long may be anywhere: it begins anew
-_ELSEWHERE = 9.0
-_OUTLIERS = 3
 _REPROJECTED = 5.0  # sigmas of pixel and pose between a fix and the pixel that it was seen at
 _ENTERS_S = 0.5
 _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
@@ -60,26 +54,24 @@ class TargetSettings:
 
 
 class TargetTrack:
-    """Track of one target; not thread-safe. moves: whether motion was measured and it has not stood
-    since for 2 s; refusal: why the last `observe` gave no position.
-    """
+    """Track of one target; not thread-safe. refusal: why the last `observe` gave no position."""
 
     def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
         self._id, self._settings, self._cast = target_id, settings, cast
-        self._static = StaticTarget(settings.map_sigma_m)
-        self._moving = TargetFilter()
-        self.moves = False
-        self._stands_since_ns = 0
-        self._outliers = 0
+        self._filter = TargetFilter()
         self._last = LastPosition(round(settings.confirm_s * 1e9))
-        self._seen_ns = 0
         self._aim: Array = np.zeros((3, 3))
         self.refusal: TargetRefusal | None = None
 
     @property
+    def moves(self) -> bool:
+        """Whether the target more probably moves than stands."""
+        return self._filter.moves
+
+    @property
     def velocity(self) -> Array | None:
         """(3,) m/s, world axes, of a moving target; None otherwise."""
-        return self._moving.velocity if self.moves else None
+        return self._filter.velocity
 
     def observe(
         self,
@@ -109,43 +101,20 @@ class TargetTrack:
             return self._refuse(TargetRefusal(RefusalReason.HOLE))
         if any(drift):
             self._aim = _aim(estimate, pixel, sigma, drift, surfaces[0])
-        if self.moves and time_ns - self._seen_ns > _GAP_S * 1e9:
-            self._moving = TargetFilter()
-        ray = ObservedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
-        moving = self._moving.update(TargetSighting(self._id, surfaces, pixel, time_ns))
-        fits = self._static.update(ray, surfaces)
-        self._outliers = 0 if fits else self._outliers + 1
-        if (fits and self._static.moves) or self._outliers >= _OUTLIERS:
-            self.moves = True
-            self._stands_since_ns = time_ns
-            self._outliers = 0
-            self._static = StaticTarget(settings.map_sigma_m)
-            fits = self._static.update(ray, surfaces)
-        elif self.moves and time_ns - self._stands_since_ns > _STANDS_S * 1e9:
-            velocity = self._moving.velocity
-            self.moves = velocity is None or float(np.hypot(*velocity[:2])) > _STANDS_MPS
-        fix = moving if self.moves else self._standing(estimate, pixel) if fits else None
-        if fix is None:
-            return self._refuse(TargetRefusal(RefusalReason.ELSEWHERE))
-        if self.moves:
-            bias = settings.bias.covariance(fix.position_world - eye)
-            fix = replace(fix, covariance=fix.covariance + bias + self._aim)
-        why = self._objection(fix, ray, surfaces)
+        if self._filter.update(eye, d, surfaces, time_ns):
+            fix = self._fix(estimate, pixel)
+            spread = ray_spread(estimate, pixel, sigma, distance, drift)
+            why = self._objection(fix, eye, d, spread, surfaces)
+        else:
+            why = TargetRefusal(RefusalReason.ELSEWHERE)
         if why and self._last.fix is None and why.reason is not RefusalReason.UNCONFIRMED:
             # Nothing was told yet, so nothing speaks for what was seen before rather than for this.
             self._begin_anew()
-            self._static.update(ray, surfaces)
-            self._moving.update(TargetSighting(self._id, surfaces, pixel, time_ns))
-        if why:
-            return self._refuse(why)
-        self._seen_ns = time_ns
-        return fix
+            self._filter.update(eye, d, surfaces, time_ns)
+        return self._refuse(why) if why else fix
 
     def _begin_anew(self) -> None:
-        self._static = StaticTarget(self._settings.map_sigma_m)
-        self._moving = TargetFilter()
-        self.moves = False
-        self._outliers = 0
+        self._filter = TargetFilter()
         self._last = LastPosition(round(self._settings.confirm_s * 1e9))
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
@@ -154,10 +123,7 @@ class TargetTrack:
         """
         if self._last.fix is None:
             return None
-        if self.moves:
-            return self._moving.expected(time_ns)
-        best = self._static.hypotheses()[0]
-        return best.position, best.covariance
+        return self._filter.expected(time_ns)
 
     def coast(self, estimate: PoseEstimate) -> TargetFix | None:
         """Predicted position of an unseen moving target, HIDDEN; None for a static one, outside the
@@ -173,8 +139,8 @@ class TargetTrack:
         pixel = pixel_of(estimate, position)
         fix = TargetFix(
             self._id, position, P + bias + self._aim, pixel,
-            estimate.exposure_time_ns, 0.0, self._moving.velocity,
-            self._moving.velocity_covariance, Visibility.HIDDEN,
+            estimate.exposure_time_ns, 0.0, self._filter.velocity,
+            self._filter.velocity_covariance, Visibility.HIDDEN,
         )  # fmt: skip
         return fix if pixel is not None and is_on_map(fix, self._cast) else None
 
@@ -185,7 +151,7 @@ class TargetTrack:
         """
         if self.moves or self._last.fix is None:
             return None
-        fix = self._standing(estimate, None)
+        fix = self._fix(estimate, None)
         away = fix.position_world - estimate.world_from_camera.translation
         pixel = pixel_of(estimate, fix.position_world)
         if pixel is None:
@@ -200,7 +166,7 @@ class TargetTrack:
         second. A target that is half hidden is seen at its visible side, so its observations are
         biased.
         """
-        velocity = self._moving.velocity
+        velocity = self._filter.velocity
         ahead = position if velocity is None else position + _ENTERS_S * velocity
         return self.is_hidden(estimate, position) or self.is_hidden(estimate, ahead)
 
@@ -211,26 +177,20 @@ class TargetTrack:
         first = float(self._cast(eye, (point - eye)[None] / distance).distances[0])
         return distance - first > max(_HIDDEN_M, beyond_m)
 
-    def _standing(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
-        """The position with the smallest expected error; other hypotheses widen its covariance."""
-        places = self._static.hypotheses()
-        best = places[0]
-        eye = estimate.world_from_camera.translation
-        bias = self._settings.bias.covariance(best.position - eye)
-        covariance, elsewhere = bias.copy(), 0.0
-        for place in places:
-            offset = place.position - best.position
-            spread = self._static.residual_ratio * place.covariance
-            covariance += place.weight * (spread + np.outer(offset, offset))
-            if offset @ np.linalg.solve(best.covariance + bias, offset) > _ELSEWHERE:
-                elsewhere += place.weight
+    def _fix(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
+        """The filter's position; the errors common to all targets are in its covariance."""
+        away = self._filter.position - estimate.world_from_camera.translation
+        position, covariance, elsewhere = self._filter.place(self._settings.bias.covariance(away))
+        covariance += self._aim if self.moves else 0.0
         return TargetFix(
-            self._id, best.position, covariance, pixel, estimate.exposure_time_ns, elsewhere
-        )
+            self._id, position, covariance, pixel, estimate.exposure_time_ns, elsewhere,
+            self._filter.velocity, self._filter.velocity_covariance,
+        )  # fmt: skip
 
     def _objection(
-        self, fix: TargetFix, ray: ObservedRay, surfaces: tuple[TargetSurface, ...]
-    ) -> TargetRefusal | None:
+        self, fix: TargetFix, eye: Array, direction: Array, spread: RaySpread,
+        surfaces: tuple[TargetSurface, ...],
+    ) -> TargetRefusal | None:  # fmt: skip
         """Why this position may not be reported; None if it may.
 
         A position may be reported if it lies under the observed pixel, at a depth that its frame
@@ -240,16 +200,16 @@ class TargetTrack:
         P, sigma = fix.covariance, float(np.sqrt(np.trace(fix.covariance)))
         if not np.isfinite(sigma) or sigma > self._settings.max_sigma_m:
             return TargetRefusal(RefusalReason.UNCERTAIN, sigma)
-        away = fix.position_world - ray.eye
+        away = fix.position_world - eye
         distance = float(np.linalg.norm(away))
-        S = ray.spread.sideways
-        r = S @ (away / distance - ray.direction)
-        C = ray.spread.covariance + S @ P @ S.T / distance**2
+        S = spread.sideways
+        r = S @ (away / distance - direction)
+        C = spread.covariance + S @ P @ S.T / distance**2
         if float(r @ np.linalg.solve(C, r)) > _REPROJECTED**2:
             return TargetRefusal(RefusalReason.NOT_UNDER_PIXEL)
         if not is_on_map(fix, self._cast):
             return TargetRefusal(RefusalReason.OFF_MAP)
-        if not is_at_seen_depth(fix, ray.eye, ray.direction, surfaces):
+        if not is_at_seen_depth(fix, eye, direction, surfaces):
             return TargetRefusal(RefusalReason.OTHER_DEPTH)
         return self._last.check(fix, moves=self.moves)
 

@@ -20,7 +20,7 @@ from localizer.geometry.shutter import Sweep
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryFrame, OdometryStatus
 from localizer.odometry.ground import TerrainModel
-from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.odometry import VisualOdometry
 from localizer.odometry.usability import find_fault
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
@@ -92,7 +92,7 @@ class DeadReckoning:
         ground: GroundUncertainty | None = None,
     ) -> None:  # fmt: skip
         self._sensors, self._pinhole = sensors, camera
-        registration = odometry_optimizer(optimizer, threads)
+        registration = JNGO(optimizer.config, optimizer.backend, threads)
         self._odometry = VisualOdometry(camera, registration, config, terrain, uncertainty=ground)
         self._longest_sigma_m = config.longest_sigma_m
         self._off_map_sigma_m = config.off_map_sigma_m

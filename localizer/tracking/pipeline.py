@@ -95,7 +95,10 @@ class Undistorter:
             size = (whole * target.width, whole * target.height)
         pinhole = target.resized(*size)
         bent = not self._middle.is_like(pinhole)  # by its lens, or by its zoom
-        self._maps = self._middle.undistortion_maps(pinhole) if bent else None
+        self._maps = None
+        if bent:  # OpenCV 5 is twice as fast with float32 maps and four channels as with three
+            maps = self._middle.undistortion_maps(pinhole)
+            self._maps = cv2.convertMaps(*maps, cv2.CV_32FC1)
         self.seen = self._seen()
         """(height, width) of the target, what the source shows of it with room to all sides; None
         where that is nearly all.
@@ -122,9 +125,12 @@ class Undistorter:
                 f"{self.source.width}x{self.source.height}: give this stream's calibration"
             )
         image = shrink(frame.image, (self._middle.width, self._middle.height))
-        if self._maps is not None:
-            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-        return shrink(image, (self._target.width, self._target.height))
+        size = self._target.width, self._target.height
+        if self._maps is None:
+            return shrink(image, size)
+        four = cv2.cvtColor(image, cv2.COLOR_RGB2RGBA)
+        straight = np.asarray(cv2.remap(four, *self._maps, cv2.INTER_LINEAR), np.uint8)
+        return np.asarray(cv2.cvtColor(shrink(straight, size), cv2.COLOR_RGBA2RGB), np.uint8)
 
 
 def mask_unseen_features(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:

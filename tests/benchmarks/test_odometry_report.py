@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common.shares import exact_interval, wilson
-from benchmarks.features.report import (
-    PairOutcome,
-    difference,
-    read_outcomes,
-    write_outcomes,
-)
+from benchmarks.features.report import PairOutcome, difference, read_outcomes, write_outcomes
 from benchmarks.features.tables import report
 from benchmarks.odometry.__main__ import main
 from benchmarks.odometry.flights import FlownStretch, OdometryStep

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from companion.conversions import CameraExtrinsics, vehicle_prior, vision_fix
-from companion.geometry import (
-    GimbalAngles,
-    GimbalFrame,
-    Mount,
-    camera_attitude,
-    world_from_camera,
-)
+from companion.geometry import GimbalAngles, GimbalFrame, Mount, camera_attitude, world_from_camera
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
 from localizer.geometry.trajectory import pose_row

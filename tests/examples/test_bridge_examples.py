@@ -30,22 +30,13 @@ from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.alerts.reading import alert_of
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
-from sitl.vehicles.launch import (
-    ArduPilotSitl,
-    EmbeddedSitl,
-    find_arducopter,
-    vision_only_parameters,
-)
+from sitl.vehicles.launch import ArduPilotSitl, EmbeddedSitl, vision_only_parameters
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID = 47.3
 GYROS_SETTLED_S = 27.0  # ArduPilot refuses to arm before
-REAL = [
-    pytest.mark.sitl,
-    pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
-]
-BOTH = [EmbeddedSitl, pytest.param(ArduPilotSitl, marks=REAL)]
+BOTH = [EmbeddedSitl, pytest.param(ArduPilotSitl, marks=pytest.mark.sitl)]
 
 
 class Example:

@@ -265,9 +265,7 @@ def lengths(of: Any, seen: set[int] | None = None) -> dict[str, int]:
     return found
 
 
-def exchanging(
-    configured: OriginConfig | None,
-) -> tuple[OriginExchange, Any, list[Alert]]:
+def exchanging(configured: OriginConfig | None) -> tuple[OriginExchange, Any, list[Alert]]:
     """An exchange of the EKF's origin with a vehicle that is not armed, its link and its alerts."""
     told: list[Alert] = []
     tracker = VehicleTracker(BridgeConfig(camera=CameraConfig(mount="fixed")))

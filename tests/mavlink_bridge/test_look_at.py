@@ -16,15 +16,11 @@ from mavlink_bridge.camera.look_at import LOOK_AHEAD, LOOK_AT_PLACE, LOOK_AT_TAR
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl, find_arducopter
+from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl
 
 SECOND = 10**9
 OK, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
 HOME = Location(47.397742, 8.545594, 488.0)
-REAL = [
-    pytest.mark.sitl,
-    pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
-]
 
 
 class Station:
@@ -146,7 +142,10 @@ def test_a_stations_command_reaches_the_autopilot_through_the_bridge(autopilot):
 
 @pytest.mark.parametrize(
     "kind",
-    [pytest.param(EmbeddedSitl, marks=pytest.mark.long), pytest.param(ArduPilotSitl, marks=REAL)],
+    [
+        pytest.param(EmbeddedSitl, marks=pytest.mark.long),
+        pytest.param(ArduPilotSitl, marks=pytest.mark.sitl),
+    ],
 )
 def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there(kind):
     """The whole way: station, routing, camera component, autopilot, mount.

@@ -30,22 +30,16 @@ def _run(*arguments):
 
 
 @pytest.mark.parametrize("command", ["demo", "sequence"])
-def test_a_folder_with_other_files_is_left_alone(tmp_path, command):
-    out = tmp_path / "mine"
+def test_a_file_and_a_folder_with_other_files_are_left_alone(tmp_path, command):
+    out, file = tmp_path / "mine", tmp_path / "mine.tex"
     out.mkdir()
     (out / "companion.yaml").touch()  # an operator may well have one of his own
-    (out / "thesis.tex").touch()
-    with pytest.raises(ScenarioError, match="mine"):
-        _run(command, *(["--out", out] if command == "demo" else [out]))
+    for path in (out / "thesis.tex", file):
+        path.touch()
+    for given in (out, file):
+        with pytest.raises(ScenarioError, match=given.name):
+            _run(command, *(["--out", given] if command == "demo" else [given]))
     assert (out / "thesis.tex").exists()
-
-
-@pytest.mark.parametrize("command", ["demo", "sequence"])
-def test_a_file_in_the_folders_place_is_named(tmp_path, command):
-    out = tmp_path / "file"
-    out.touch()
-    with pytest.raises(ScenarioError, match="file"):
-        _run(command, *(["--out", out] if command == "demo" else [out]))
 
 
 def test_an_earlier_report_is_replaced(tmp_path):

@@ -104,7 +104,7 @@ class CudaSchedule:
                 events.append(self._device.event())
             last = len(channels) - 1 if config.sharpen else len(config.iterations) - 1
             count = len(anchors.points_world)
-            result, sums, scale = self._collect(memory, config, count, channels[last], cell_px)
+            result, sums, scale = self._collect(memory, config, count, channels[last])
             if len(result.survivors.scores) > 0 and result.finite:
                 points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
                 level = query.levels[last]
@@ -213,7 +213,7 @@ class CudaSchedule:
         self._device.upload(memory.base, frame)
 
     def _collect(
-        self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int, cell_px: float
+        self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
     ) -> tuple[DeviceSearchResult, CovarianceSums, float]:
         """The download, its sums without motion, counts and curvature, and the last scale."""
         block = np.empty(memory.result_size, np.uint8)
@@ -237,7 +237,6 @@ class CudaSchedule:
             _symmetric(state["meat"]) / total**2,
             _symmetric(state["isotropic"]) / total**2 * variance,
             int(state["cells"]),
-            cell_px,
             prior_hessian=np.zeros((6, 6)),
             motion=np.zeros((6, 6)),
             anchors=0,

@@ -121,8 +121,7 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("focal", "seconds", "denied"),
-    [(0.2, 3.0, False), (0.05, 0.0, True), (-0.2, 3.0, True)],
+    ("focal", "seconds", "denied"), [(0.2, 3.0, False), (0.05, 0.0, True), (-0.2, 3.0, True)]
 )
 def test_a_stream_that_zooms_without_saying_so_is_told(focal, seconds, denied):
     """After 50 s of a right lens, in which all was learned; and nothing else is blamed."""

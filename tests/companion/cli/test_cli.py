@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +210,13 @@ class Vehicle(FakeAutopilot):
             signing.timestamp = m.initial_timestamp
 
 
+@pytest.fixture
+def vehicle() -> Iterator[Vehicle]:
+    listening = Vehicle()
+    yield listening
+    listening.stop()
+
+
 def test_a_key_is_made_for_its_owner_and_never_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.key"
     result = CliRunner().invoke(app, ["key", str(path)])
@@ -229,29 +237,21 @@ def test_a_connection_that_is_none_is_told_before_a_key_is_made(tmp_path: Path) 
     assert not path.exists()
 
 
-def test_the_vehicle_signs_with_the_installed_key(tmp_path: Path) -> None:
-    path, vehicle = tmp_path / "mavlink.key", Vehicle()
-    try:
-        where = f"udpout:127.0.0.1:{vehicle.port}"
-        result = CliRunner().invoke(app, ["key", str(path), "--install", where])
-        assert result.exit_code == 0, result.output
-        assert "heartbeat is signed" in result.output
-        assert vehicle.codec.signing.secret_key == load_key(path)
-    finally:
-        vehicle.stop()
+def test_the_vehicle_signs_with_the_installed_key(tmp_path: Path, vehicle: Vehicle) -> None:
+    path, where = tmp_path / "mavlink.key", f"udpout:127.0.0.1:{vehicle.port}"
+    result = CliRunner().invoke(app, ["key", str(path), "--install", where])
+    assert result.exit_code == 0, result.output
+    assert "heartbeat is signed" in result.output
+    assert vehicle.codec.signing.secret_key == load_key(path)
 
 
-def test_an_armed_vehicle_is_given_no_key(tmp_path: Path) -> None:
-    path, vehicle = tmp_path / "mavlink.key", Vehicle()
+def test_an_armed_vehicle_is_given_no_key(tmp_path: Path, vehicle: Vehicle) -> None:
+    path, where = tmp_path / "mavlink.key", f"udpout:127.0.0.1:{vehicle.port}"
     vehicle.armed = True
-    try:
-        where = f"udpout:127.0.0.1:{vehicle.port}"
-        result = CliRunner().invoke(app, ["key", str(path), "--install", where])
-        assert isinstance(result.exception, BridgeStateError)
-        assert "disarm" in str(result.exception)
-        assert not vehicle.of("SETUP_SIGNING")
-    finally:
-        vehicle.stop()
+    result = CliRunner().invoke(app, ["key", str(path), "--install", where])
+    assert isinstance(result.exception, BridgeStateError)
+    assert "disarm" in str(result.exception)
+    assert not vehicle.of("SETUP_SIGNING")
 
 
 # --- What a command is doing goes to standard error, what it found to standard output -----------

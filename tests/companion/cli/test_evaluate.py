@@ -159,7 +159,8 @@ def test_frames_outside_the_map_count_as_not_localized(recorded, tmp_path):
 def test_real_photos_are_localized_on_their_orthophoto(real_data, tmp_path):
     """caliterra's photos over its DSM and orthophoto, each frame from a prior of its own."""
     folder = real_data("caliterra")
-    options = ["--geoid-separation", "0", "--trust", "geoid", "--vertical-datum", "ellipsoidal"]
+    options = ["--geoid-separation", "0", "--trust", "geoid", "--vertical-datum", "ellipsoidal",
+               "--workers", "1"]  # fmt: skip
     sources = [str(folder / "dsm.tif"), str(folder / "ortho.tif")]
     built = CliRunner().invoke(
         app, ["map", "build", *sources, "--out", str(tmp_path / "map"), *options]

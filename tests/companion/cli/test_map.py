@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import ConfigError, ReportError
 from localizer.map.building import build
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from tests.localizer.map.conftest import write_tileset
 
@@ -24,13 +23,6 @@ from tests.localizer.map.conftest import write_tileset
 def source(tmp_path_factory):
     """tileset.json of a tileset of 21 tiles."""
     return write_tileset(tmp_path_factory.mktemp("source"))
-
-
-@pytest.fixture(scope="module")
-def cache(source, tmp_path_factory):
-    out = tmp_path_factory.mktemp("built") / "cache"
-    build.build_cache(source, out, BuildOptions(workers=1))
-    return TileCache.open(out)
 
 
 def run(*arguments):
@@ -114,27 +106,29 @@ def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
     ("place", "why"),
     [("none/v.png", "no such folder"), ("v.png", "cannot be written: No space left")],
 )
-def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch, what, place, why):
+def test_a_place_that_cannot_be_written_is_one_line(
+    terrain, tmp_path, monkeypatch, what, place, why
+):
     def full(_path, _data):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
     pose = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500, "--width", 64]
     place = (tmp_path / place).with_suffix(".png" if what == "render" else ".glb")
-    result = run(what, cache.path, *(pose if what == "render" else ()), "--out", place)
+    result = run(what, terrain.path, *(pose if what == "render" else ()), "--out", place)
     assert isinstance(result.exception, ReportError)
     assert why in str(result.exception)
 
 
-def test_info_says_where_the_map_is_and_writes_its_outline(cache, tmp_path):
+def test_info_says_where_the_map_is_and_writes_its_outline(terrain, tmp_path):
     geojson, kml = tmp_path / "area.geojson", tmp_path / "area.kml"
-    result = run("info", cache.path, "--geojson", geojson, "--kml", kml)
+    result = run("info", terrain.path, "--geojson", geojson, "--kml", kml)
     assert result.exit_code == 0
     assert "47.19" in result.output
     assert "EGM96 there: 47.75" in result.output
-    refused = run("info", cache.path, "--kml", "/dev/full")
+    refused = run("info", terrain.path, "--kml", tmp_path / "area.txt")
     assert "--kml" in str(refused.exception)
-    missing = run("info", cache.path, "--geojson", tmp_path / "none" / "area.geojson")
+    missing = run("info", terrain.path, "--geojson", tmp_path / "none" / "area.geojson")
     assert re.search("--geojson .*no such folder", str(missing.exception))
     (feature,) = json.loads(geojson.read_text())["features"]
     ring = np.array(feature["geometry"]["coordinates"][0])

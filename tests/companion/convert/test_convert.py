@@ -19,12 +19,7 @@ from companion.flight.recorder import ESTIMATE_COLUMNS
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
-from localizer.geometry.trajectory import (
-    PoseRow,
-    read_poses,
-    world_from_camera,
-    write_poses,
-)
+from localizer.geometry.trajectory import PoseRow, read_poses, world_from_camera, write_poses
 from tests.companion.recorded.photos import dji, write_photo
 
 ORIGIN = Geodetic(47.3, 8.5, 450.0)

@@ -28,11 +28,7 @@ from companion.offline.record import poses, read_columns
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.types import (
-    Frame,
-    TargetFix,
-    Visibility,
-)
+from localizer.types import Frame, TargetFix, Visibility
 from mavlink_bridge.link.clock import utc_us
 from tests.companion.estimates import estimated
 

@@ -133,7 +133,8 @@ class Slow:
 def slowly(cache, monkeypatch):
     """Makes a search with a slow relocalizer, all on the autopilot's clock."""
 
-    def make(autopilot, reach=None):
+    def make(reach=None, velocity=None):
+        autopilot = Falling(velocity)
         slow = Slow(autopilot)
         monkeypatch.setattr("companion.flight.search.open_relocalizer", lambda *_, **__: slow)
         about = SearchRegion.circle(np.zeros(2), 100.0)
@@ -143,14 +144,13 @@ def slowly(cache, monkeypatch):
         )  # fmt: skip
         search.start()
         search.stop()
-        return search, slow
+        return search, slow, autopilot
 
     return make
 
 
 def test_a_place_of_seconds_ago_is_looked_for_again_where_it_can_be_by_now(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     assert search.search(falling.frame(), lambda: False) is None  # 12 m from where we are by now
     prior = search.search(falling.frame(), lambda: False)
     assert np.linalg.norm(prior.world_from_camera.translation - falling.place) < 2.0
@@ -160,8 +160,7 @@ def test_a_place_of_seconds_ago_is_looked_for_again_where_it_can_be_by_now(slowl
 
 
 def test_the_frames_of_the_last_seconds_are_searched_with_every_second_time(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     slow.blind, slow.wide_s = True, 0.0
     for _ in range(75):  # five a second
         falling.time_s += 0.2
@@ -183,7 +182,7 @@ def test_the_frames_of_the_last_seconds_are_searched_with_every_second_time(slow
 
 
 def test_a_kept_frame_is_small_and_its_camera_sees_as_far(slowly):
-    search, slow = slowly(Falling())
+    search, slow, _ = slowly()
     slow.blind, large = True, Camera.from_fov(1920, 1080, 70.0)
     first, later = (
         Frame(np.zeros((1080, 1920, 3), np.uint8), k * 1_000_000_000, large, k) for k in (1, 2)
@@ -196,8 +195,7 @@ def test_a_kept_frame_is_small_and_its_camera_sees_as_far(slowly):
 
 
 def test_frames_are_kept_again_after_the_cameras_clock_jumped_back(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     slow.blind = True
     for time_s in (60.0, 61.0, 10.0, 11.0):
         falling.time_s = time_s
@@ -208,8 +206,7 @@ def test_frames_are_kept_again_after_the_cameras_clock_jumped_back(slowly):
 
 
 def test_a_place_that_three_frames_do_not_show_again_is_forgotten(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     search.search(falling.frame(), lambda: False)
     slow.blind = True
     for _ in range(3):
@@ -222,8 +219,7 @@ def test_a_place_that_three_frames_do_not_show_again_is_forgotten(slowly):
 
 
 def test_a_place_that_is_found_at_once_is_given_at_once(slowly, cache):
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     search.hint(0.0, 10.0, 30.0)
     assert search.search(falling.frame(), lambda: False) is not None
     assert len(slow.queries) == 1
@@ -244,8 +240,7 @@ def test_a_search_that_is_not_ready_or_cannot_be_says_so(cache, monkeypatch):
 
 
 def test_without_the_autopilots_attitude_it_says_what_it_waits_for(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     assert search.lacks is None
     falling.attitude = None
     search.search(falling.frame(), lambda: False)
@@ -258,8 +253,7 @@ def test_without_the_autopilots_attitude_it_says_what_it_waits_for(slowly):
 
 def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, cache):
     """At 30 km that lies 70 m above the ellipsoid: no height that was tried was the right one."""
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     search.hint(0.0, 30_000.0, 30.0)
     search.search(falling.frame(), lambda: False)
     place = cache.frame.position(np.array([0.0, 30_000.0, slow.queries[0].height_m]))
@@ -268,8 +262,7 @@ def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, c
 
 def test_the_place_that_a_search_of_a_large_map_finds_is_followed_to_now(slowly):
     """A search of 45 s found where the camera had been, and the next one began anew for ever."""
-    falling = Falling()
-    search, slow = slowly(falling)
+    search, slow, falling = slowly()
     slow.wide_s = 45.0
     assert search.search(falling.frame(), lambda: False) is None
     slow.wide_s = 1.0
@@ -282,27 +275,21 @@ def test_the_place_that_a_search_of_a_large_map_finds_is_followed_to_now(slowly)
     assert followed.heading_sigma_rad > again.heading_sigma_rad
 
 
-def test_a_place_of_long_ago_says_nothing(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
-    search.search(falling.frame(), lambda: False)
-    falling.time_s += 120.0
-    search.search(falling.frame(), lambda: False)
-    assert slow.queries[1].region.centre == pytest.approx([0.0, 0.0])
-
-
-def test_an_operators_word_comes_before_what_was_found_earlier(slowly):
-    falling = Falling()
-    search, slow = slowly(falling)
+@pytest.mark.parametrize(
+    ("gone_s", "hint", "centre"), [(120.0, (), 0.0), (0.0, (500.0, 0.0), 500.0)]
+)
+def test_a_place_of_long_ago_or_before_an_operators_word_says_nothing(slowly, gone_s, hint, centre):
+    search, slow, falling = slowly()
     assert search.search(falling.frame(), lambda: False) is None
-    search.hint(500.0, 10.0, 30.0)
+    falling.time_s += gone_s
+    if hint:
+        search.hint(*hint, 30.0)
     search.search(falling.frame(), lambda: False)
-    assert slow.queries[1].region.centre == pytest.approx([500.0, 10.0])
+    assert slow.queries[1].region.centre == pytest.approx([centre, 0.0])
 
 
 def test_after_a_long_search_it_is_looked_for_where_it_circled_and_straight_on(slowly):
-    falling = Falling(np.array([20.0, 0.0, -2.0]))
-    search, slow = slowly(falling)
+    search, slow, falling = slowly(velocity=np.array([20.0, 0.0, -2.0]))
     slow.wide_s = 45.0
     assert search.search(falling.frame(), lambda: False) is None
     search.search(falling.frame(), lambda: False)
@@ -320,8 +307,9 @@ def test_the_next_search_is_as_near_as_the_motion_is_known(slowly, jump_m, centr
         t = time_ns * 1e-9
         return SearchRegion.circle(np.array([3.0 * t + jump_m * (t > 1.0), 0.0]), 80.0 + t)
 
-    falling = Falling(np.array([3.0, 0.0, -2.0]) if jump_m is None else None)
-    search, slow = slowly(falling, None if jump_m is None else reach)
+    search, slow, falling = slowly(
+        *((None, np.array([3.0, 0.0, -2.0])) if jump_m is None else (reach,))
+    )
     assert search.search(falling.frame(), lambda: False) is None
     search.search(falling.frame(), lambda: False)
     region = slow.queries[1].region

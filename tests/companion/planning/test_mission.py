@@ -13,6 +13,10 @@ PATTERN = {
     "type": "ComplexItem", "version": 2, "altitudesAreRelative": True, "loiterRadius": 75,
     "landCoordinate": [47.1991, 8.2009, 0], "landingApproachCoordinate": [47.2009, 8.2009, 40],
 }  # fmt: skip
+ENDLESS = (
+    '{"mission": {"plannedHomePosition": [47, 8, 0], "items": '
+    '[{"type": "SimpleItem", "command": 1e999, "frame": 3, "params": [0,0,0,0,0,0,0]}]}}'
+)
 
 
 def item(command, *numbers, frame=3, **more):
@@ -100,8 +104,26 @@ def test_a_file_that_breaks_off_is_named(tmp_path):
         path.write_text(path.read_text()[:-3])
         with pytest.raises(MissionFileError, match=f"{name}.*{why}"):
             read_mission(path)
-    path.write_text("")
-    with pytest.raises(MissionFileError, match="it is empty"):
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "it is empty"),
+        ("[]", r"no \.plan"),
+        (ENDLESS, r"no \.plan"),
+        ('{"mission": {"items": []}}', "plannedHomePosition"),
+        ('{"mission": {"plannedHomePosition": [NaN, 8, 0], "items": []}}', "home is no place"),
+        ("hello", "no QGC WPL"),
+        ("QGC WPL 110\n0 1 0 16 x", "5 of 12 fields"),
+        ("QGC WPL 110\n0 1 0 16 0 0 0 0 47 8 440 1", "holds no waypoint"),
+        ("QGC WPL 110\n0 1 0 16 0 0 0 0 47 8 4 1\n1 0 3 16 0 0 0 0 nan 8 50 1", "no place"),
+    ],
+)
+def test_a_file_that_is_no_mission_is_named(tmp_path, text, named):
+    path = tmp_path / "a.plan"
+    path.write_text(text)
+    with pytest.raises(MissionFileError, match=f"a.plan: .*{named}"):
         read_mission(path)
 
 
@@ -172,4 +194,6 @@ def test_mission_planners_rows_of_a_round_and_a_speed(tmp_path):
         (6, 0, 3, 177, 4, 3, 0, 0, 0, 0, 0, 1), (7, 0, 3, 20, 0, 0, 0, 0, 0, 0, 0, 1),
     )  # fmt: skip
     assert [p.name for p in mission.path] == ["home", *"12" * 4, "home"]
-    assert mission.speed_m_s == 18
+    assert (mission.home, mission.takeoff_height_m, mission.speed_m_s) == ((47.2, 8.2), 80, 18)
+    first = mission.waypoints[0]
+    assert (first.latitude_deg, first.longitude_deg, first.height_m) == (47.2005, 8.1995, 80)

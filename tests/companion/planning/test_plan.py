@@ -28,11 +28,9 @@ from companion.planning.verdicts import (
 from companion.planning.way import Aim, MapHeights, camera_pose, legs_of
 from companion.preflight.map_pin import map_hash
 from localizer.forecast.forecast import AmbiguousPosition, Figures, ViewForecast
-from localizer.map.building import build
-from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import OdometryConfig
-from tests.localizer.map.conftest import height, write_tileset
+from tests.localizer.map.conftest import height
 
 DEPLOYMENT = """
 map: {map}
@@ -44,10 +42,8 @@ GIMBAL = Aim(Mount.from_degrees(), -75.0, False)
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("map")
-    build.build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
-    return TileCache.open(folder / "cache")
+def cache(terrain):
+    return terrain
 
 
 def place(cache, east, north):

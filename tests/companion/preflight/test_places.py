@@ -13,12 +13,9 @@ from companion.config import parse_config
 from companion.preflight.coverage import check_heights
 from companion.preflight.doctor import check_places
 from localizer.geometry.geo import Geodetic, LocalFrame
-from localizer.map.building.build import build_cache
-from localizer.map.building.options import BuildOptions
-from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.messages import VehicleState
-from tests.localizer.map.conftest import ORIGIN, SEPARATION_M, height, write_tileset
+from tests.localizer.map.conftest import ORIGIN, SEPARATION_M, height
 
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
 
@@ -69,13 +66,6 @@ def test_what_a_start_makes_itself_is_no_fault(tmp_path: Path) -> None:
 # --- The doctor's view of the map's heights: right ones pass, each wrong one is seen ------------
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("map")
-    build_cache(write_tileset(folder / "source"), folder / "cache", BuildOptions(workers=1))
-    return TileCache.open(folder / "cache")
-
-
 def standing(east=30.0, north=-40.0, geoid_m=SEPARATION_M, above_m=0.0):
     """A vehicle on the ground of the test terrain."""
     ground = float(height(east, north))
@@ -109,12 +99,12 @@ WITHIN, ADVICE, WRONG = (True, False), (False, False), (False, True)  # (ok, req
         (replace(standing(), gps_height_m=None), None, WITHIN),
     ],
 )
-def test_heights_that_disagree_are_told(cache, state, geoid, ground):
-    found = {f.name: (f.ok, f.required) for f in check_heights(cache, state)}
+def test_heights_that_disagree_are_told(terrain, state, geoid, ground):
+    found = {f.name: (f.ok, f.required) for f in check_heights(terrain, state)}
     expected = {"geoid": geoid, "take-off height": ground}
     assert found == {name: told for name, told in expected.items() if told is not None}
 
 
-def test_both_geoids_are_told(cache):
-    geoid, _ = check_heights(cache, standing(geoid_m=SEPARATION_M + 1.5))
+def test_both_geoids_are_told(terrain):
+    geoid, _ = check_heights(terrain, standing(geoid_m=SEPARATION_M + 1.5))
     assert geoid.found == "47.5 m in the map, 49.0 m by GNSS"

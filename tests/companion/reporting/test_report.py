@@ -13,14 +13,7 @@ from companion.cli.commands import app
 from companion.errors import RecordError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from companion.offline.record import read_record
-from companion.reporting.content import (
-    INNER,
-    MapSheet,
-    MapTrack,
-    Report,
-    ReportEvent,
-    Stanford,
-)
+from companion.reporting.content import INNER, MapSheet, MapTrack, Report, ReportEvent, Stanford
 from companion.reporting.figures import first_fault
 from companion.reporting.layout import render
 from companion.reporting.record import record_report, worst_frames

@@ -18,19 +18,9 @@ from companion.preflight.map_pin import map_hash
 from companion.settings_file import settable_fields
 from companion.setup.write import differing_settings, reference
 from localizer.errors import MapCacheError
-from localizer.map.building import build
-from localizer.map.building.options import BuildOptions
 from tests.companion.test_config import DEPLOYMENT, MINIMAL, MODEL
-from tests.localizer.map.conftest import write_tileset
 
 EXAMPLES = {"map", "camera.source", "bridge.connection", "record.folder"}
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("map")
-    build.build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
-    return folder / "cache"
 
 
 @pytest.fixture
@@ -88,18 +78,18 @@ def test_the_shipped_deployment_file_differs_from_the_defaults_in_its_examples_o
 
 
 def test_map_and_stream_are_asked_and_a_silent_vehicle_is_noted(
-    cache, video, tmp_path, monkeypatch
+    terrain, video, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("mavlink_bridge.preflight.client._CONNECT_S", 0.2)
     out = tmp_path / "deployment.yaml"
-    answers = f"{cache}\n{video}\nudpin:127.0.0.1:0\ngimbal\n60\n"
+    answers = f"{terrain.path}\n{video}\nudpin:127.0.0.1:0\ngimbal\n60\n"
     done = CliRunner().invoke(app, ["init", str(out)], input=answers)
     assert done.exit_code == 0, done.output
     config, text = load_config(out), out.read_text()
     assert (config.camera.model.width, config.camera.model.height) == (640, 480)
     assert config.camera.model.fx == pytest.approx(320 / np.tan(np.radians(30)))
-    assert config.map == cache
-    assert config.map_sha256 == map_hash(cache)
+    assert config.map == terrain.path
+    assert config.map_sha256 == map_hash(terrain.path)
     assert config.bridge.mode == "shadow"
     assert "no vehicle was heard" in text
     assert "not a calibration" in text
@@ -110,23 +100,23 @@ def test_map_and_stream_are_asked_and_a_silent_vehicle_is_noted(
     assert out.read_text() == text
 
 
-def test_where_nobody_answers_the_option_is_named(cache, tmp_path):
+def test_where_nobody_answers_the_option_is_named(terrain, tmp_path):
     """In a script it ended with "Aborted." before."""
-    words = ["init", str(tmp_path / "d.yaml"), "--map", str(cache), "--source", "a", "--no-listen",
-             "--connection", "udpin:127.0.0.1:14551", "--fov", "60"]  # fmt: skip
+    words = ["init", str(tmp_path / "d.yaml"), "--map", str(terrain.path), "--source", "a",
+             "--no-listen", "--connection", "udpin:127.0.0.1:14551", "--fov", "60"]  # fmt: skip
     done = CliRunner().invoke(app, words, input="")
     assert isinstance(done.exception, ConfigError)
     assert "camera mount (gimbal, fixed): nobody answers here; give --mount" in str(done.exception)
 
 
-def test_a_calibration_of_another_size_is_told(cache, video, tmp_path):
+def test_a_calibration_of_another_size_is_told(terrain, video, tmp_path):
     lens = tmp_path / "camera.json"
     lens.write_text(json.dumps(MODEL | {"width": 1280, "cx": 640}))
     out = tmp_path / "d.yaml"
     done = CliRunner().invoke(
         app,
-        ["init", str(out), "--map", str(cache), "--source", str(video), "--camera", str(lens),
-         "--connection", "udpin:127.0.0.1:14551", "--mount", "fixed", "--no-listen"],
+        ["init", str(out), "--map", str(terrain.path), "--source", str(video), "--camera",
+         str(lens), "--connection", "udpin:127.0.0.1:14551", "--mount", "fixed", "--no-listen"],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     config = load_config(out)

@@ -278,18 +278,21 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+def _supervised(policy: RestartPolicy, *script: str) -> list[Alert]:
+    """What is told of real processes that run it, until the last has ended well."""
+    told: list[Alert] = []
+    command = [sys.executable, "-S", "-c", *script]
+
+    def begin(standby: bool) -> FlightProcess:
+        return FlightProcess(command, standby=standby)
+
+    assert Supervisor(begin, told.append, lambda *_: None, policy).run() == 0
+    return told
+
+
 def test_real_processes_killed_and_released(tmp_path: Path) -> None:
     """kill -9 on the one that flies; the standby takes over and ends in order."""
-    told: list[Alert] = []
-    command = [sys.executable, "-S", "-c", _CHILD, str(tmp_path)]
-    supervisor = Supervisor(
-        lambda standby: FlightProcess(command, standby=standby),
-        told.append,
-        lambda *_: None,
-        RestartPolicy(standby_after_s=0.0),
-    )
-    assert supervisor.run() == 0
-    assert told == [DIED]
+    assert _supervised(RestartPolicy(standby_after_s=0.0), _CHILD, str(tmp_path)) == [DIED]
 
 
 @pytest.mark.parametrize(
@@ -389,16 +392,8 @@ while True:
 
 @pytest.mark.parametrize(("how", "what"), [("stops", "process"), ("blocks", "localize")])
 def test_real_processes_that_stop_or_block_are_ended(how: str, what: str) -> None:
-    told: list[Alert] = []
-    command = [sys.executable, "-S", "-c", _HANGING, how]
-    supervisor = Supervisor(
-        lambda standby: FlightProcess(command, standby=standby),
-        told.append,
-        lambda *_: None,
-        RestartPolicy(standby_after_s=0.0, silent_s=0.6),
-    )
-    assert supervisor.run() == 0
-    assert told == [hanging(what)]
+    policy = RestartPolicy(standby_after_s=0.0, silent_s=0.6)
+    assert _supervised(policy, _HANGING, how) == [hanging(what)]
 
 
 def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:

@@ -27,7 +27,8 @@ _FEW = 12  # frames
 
 def _map(folder: Path, out: Path) -> Path:
     heights = next(f for f in (folder / "dsm.tif", folder / "ground.tif") if f.is_file())
-    build_cache([heights, folder / "ortho.tif"], out, BuildOptions(vertical_datum="ellipsoidal"))
+    options = BuildOptions(vertical_datum="ellipsoidal", workers=1)
+    build_cache([heights, folder / "ortho.tif"], out, options)
     return out
 
 

@@ -60,38 +60,26 @@ def keys(values, names=NAMES):
           "D": [BROWN], "lens": 3.0, "sensorwidth": 3.68, "version": 0}, "opencv", BROWN),
         ({"width": 640, "height": 480, "distortion_model": "plumb_bob", "d": BROWN, "k": MATRIX,
           "r": [0.0] * 9, "p": [0.0] * 12}, "opencv", BROWN),
+        # ROS, written by camera_calibration
+        ("image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+         f"  data: {MATRIX}\ndistortion_model: rational_polynomial\n"
+         f"distortion_coefficients:\n  rows: 1\n  cols: 8\n  data: {list(MILD)}\n", "opencv", MILD),
+        # OpenCV's FileStorage
+        ("%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
+         f"camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: {MATRIX}\n"
+         "distortion_coefficients: !!opencv-matrix\n   rows: 8\n   cols: 1\n   dt: d\n"
+         f"   data: {list(MILD)}\n", "opencv", MILD),
+        # COLMAP's cameras.txt
+        ("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+         f"1 FULL_OPENCV 640 480 500 500 320 240 {' '.join(map(str, MILD))}\n", "opencv", MILD),
     ],
 )  # fmt: skip
 def test_a_lens_is_read_whole(tmp_path, data, model, distortion):
-    path = tmp_path / "camera.json"
-    path.write_text(json.dumps(data))
+    path = tmp_path / "camera"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
     assert Camera.from_json(path) == Camera(
         640, 480, 500.0, 500.0, 320.0, 240.0, distortion, distortion_model=model
     )
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        # ROS, written by camera_calibration
-        "image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-        f"  data: {MATRIX}\ndistortion_model: rational_polynomial\n"
-        f"distortion_coefficients:\n  rows: 1\n  cols: 8\n  data: {list(MILD)}\n",
-        # OpenCV's FileStorage
-        "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
-        f"camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: {MATRIX}\n"
-        "distortion_coefficients: !!opencv-matrix\n   rows: 8\n   cols: 1\n   dt: d\n"
-        f"   data: {list(MILD)}\n",
-        # COLMAP's cameras.txt
-        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-        f"1 FULL_OPENCV 640 480 500 500 320 240 {' '.join(map(str, MILD))}\n",
-    ],
-    ids=["ros", "opencv", "colmap"],
-)
-def test_files_of_other_programs_are_read(tmp_path, text):
-    path = tmp_path / "camera"
-    path.write_text(text)
-    assert Camera.from_json(path) == Camera(640, 480, 500.0, 500.0, 320.0, 240.0, MILD)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.estimate import OdometryFrame
 from localizer.odometry.ground import FlatGround
-from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.odometry import VisualOdometry
 from localizer.odometry.usability import find_fault
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import attitude_constraint, combine, height_constraint
@@ -112,7 +112,7 @@ def flown(
     The prediction is the tracker's. tilt_sigma_deg: noise of the autopilot's tilt.
     """
     extractor = DetailExtractor(load_extractor(threads=1, size=(WORKING.width, WORKING.height)))
-    vo = VisualOdometry(WORKING, odometry_optimizer(JNGO(threads=1)), ground=FlatGround(0.0))
+    vo = VisualOdometry(WORKING, JNGO(threads=1), ground=FlatGround(0.0))
     rng, config, velocity = np.random.default_rng(seed), motion.MotionConfig(), np.zeros(3)
     velocity[1] = 0.0 if hovers else SPEED_M_S
     state = motion.start(PosePrior(pose(0), BEGUN, 0, velocity), config)

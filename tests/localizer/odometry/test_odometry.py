@@ -20,7 +20,7 @@ from localizer.odometry.ground import (
     height_above_ground,
 )
 from localizer.odometry.keyframe import DepthSource, keyframe_anchors
-from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.odometry import VisualOdometry
 from localizer.odometry.parallax import ParallaxAlignment, ParallaxView, align
 from localizer.odometry.usability import ImageFault, find_fault
 from localizer.registration.cpu.kernel import NumbaBackend
@@ -42,9 +42,8 @@ def odometry(
     uncertainty: GroundUncertainty | None = None,
     **changes: object,
 ) -> VisualOdometry:
-    optimizer = odometry_optimizer(JNGO(threads=1))
     config = OdometryConfig(**{"anchors": 600, **changes})
-    return VisualOdometry(CAMERA, optimizer, config, ground, uncertainty=uncertainty)
+    return VisualOdometry(CAMERA, JNGO(threads=1), config, ground, uncertainty=uncertainty)
 
 
 def begun(flight: Flight, vo: VisualOdometry, *, mapped: bool, **more) -> VisualOdometry:

@@ -17,7 +17,7 @@ from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame
-from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.odometry import VisualOdometry
 from localizer.pictures import read_rgb
 from localizer.registration.jngo import JNGO
 from localizer.tracking.pipeline import Undistorter, working_camera
@@ -64,7 +64,7 @@ class PhotoFlight:
 
     def step(self, begun: str, seen: str, prediction: Pose) -> OdometryEstimate:
         """From a photo with a known pose to what is seen, a second later."""
-        odometry = VisualOdometry(self.camera, odometry_optimizer(JNGO(threads=1), 1))
+        odometry = VisualOdometry(self.camera, JNGO(threads=1))
         surface = self.surface(begun)
         odometry.begin(self.frame(begun, BEGIN_NS), self.poses[begun], BEGUN, surface=surface)
         prior = PosePrior(prediction, PREDICTED, BEGIN_NS + STEP_NS)

@@ -85,50 +85,6 @@ def test_few_anchors_count_for_less_than_their_noise_says(problem, pose):
     np.testing.assert_allclose(few, 2.0 * many, rtol=1e-3)
 
 
-def displaced(level, pose, cell_px):
-    """Sums without noise, in cells of `cell_px`, and the cells of the anchors in view, with J."""
-    model = anchor_model(level, *pose, SETTINGS, cell_px)
-    sums = covariance_sums(model)
-    assert sums is not None
-    none = np.zeros((6, 6))
-    return replace(sums, meat=none, isotropic=none), model
-
-
-@pytest.mark.parametrize("curvature", [1.0, 0.4])
-def test_displaced_patches_of_the_map_move_the_pose_as_far_as_it_says(problem, pose, curvature):
-    """Patches of 20 px, each shifted by 0.5 px (sigma) in either direction, seen by plain least
-    squares.
-    """
-    side, sigma_px = 20.0, 0.5
-    sums, model = displaced(problem[0], pose, side)
-    J, rng = model.projection, np.random.default_rng(2)
-    normal = np.linalg.inv(np.einsum("nai,naj->ij", J, J))
-    moves = sigma_px * rng.standard_normal((3000, sums.cells, 2))[:, model.cell]
-    errors = np.einsum("nai,mna->mi", J, moves, optimize=True) @ normal
-    px_per_m = np.sqrt(0.5 * (sums.motion[0, 0] + sums.motion[1, 1]))
-    noise = NoiseModel(1.0, map_error=(sigma_px / px_per_m) * (side / px_per_m))
-    claimed = sandwich_covariance(replace(sums, curvature=curvature), noise)
-    assert claimed is not None
-    seen = np.cov(errors.T)
-    ratio = np.exp((np.linalg.slogdet(claimed)[1] - np.linalg.slogdet(seen)[1]) / 6)
-    assert 0.6 < ratio < 1.4
-
-
-def test_a_prior_holds_against_a_displaced_map(problem, pose):
-    sums, _ = displaced(problem[0], pose, 20.0)
-    noise = NoiseModel(1.0, map_error=0.1)
-    free = sandwich_covariance(sums, noise)
-    held = sandwich_covariance(replace(sums, prior_hessian=1e3 * sums.hessian), noise)
-    assert free is not None
-    np.testing.assert_allclose(held, free / 1001.0**2, rtol=1e-6)
-
-
-def test_anchors_that_do_not_span_a_pose_have_no_covariance(problem, pose):
-    sums = summed(problem[0], pose, 10_000)
-    flat = replace(sums, motion=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
-    assert sandwich_covariance(flat, NoiseModel(1.0, map_error=0.1)) is None
-
-
 def test_distances_between_poses_are_those_of_the_image(scene, problem, pose):
     level, _ = problem
     x, before = project(level, *pose)

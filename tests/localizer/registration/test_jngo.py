@@ -145,7 +145,7 @@ def test_covariance_matches_the_errors(scene_factory, prior):
     The noise of the 300 anchors is independent here and the map exact, so nothing is left for the
     factors.
     """
-    jngo = JNGO(JNGOConfig(correlation=1.0, few_anchors=0.0, map_error_m2=0.0))
+    jngo = JNGO(JNGOConfig(correlation=1.0, few_anchors=0.0))
     nees = []
     for seed in range(24):
         scene = scene_factory(200 + seed, 1.0, 1.0)
@@ -162,7 +162,7 @@ def test_the_covariance_knows_how_many_anchors_were_used(scene, prior):
     about = prior(scene.reference, 1.0, 1.0)
 
     def covariance(few_anchors):
-        jngo = JNGO(JNGOConfig(few_anchors=few_anchors, map_error_m2=0.0))
+        jngo = JNGO(JNGOConfig(few_anchors=few_anchors))
         return jngo.register(scene.query, scene.camera, scene.anchors, about).covariance
 
     growth = np.trace(covariance(300.0)) / np.trace(covariance(0.0))

@@ -20,7 +20,7 @@ from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.preflight.rules import ardupilot_rules, find_source_set, missing_feature
 from mavlink_bridge.vehicle.profile import select_profile
 from sitl.geodesy import Location
-from sitl.vehicles.launch import ArduPilotSitl, find_arducopter
+from sitl.vehicles.launch import ArduPilotSitl
 from tests.mavlink_bridge.simulated import GEOID, HOME, METRE, MS, SECOND, Flight
 
 COMMAND = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
@@ -160,7 +160,6 @@ def test_it_has_no_source_set_and_is_for_ardupilot_only() -> None:
 
 
 @pytest.mark.sitl
-@pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary")
 def test_ardupilot_of_today_refuses_it_beside_gnss_and_is_asked_once() -> None:
     injection = INJECTION.model_copy(update={"force": True})  # the shadow check is not the subject
     with ArduPilotSitl(Location(*HOME, 488.0)) as vehicle:

@@ -24,26 +24,16 @@ from mavlink_bridge.alerts.catalogue import alert, text
 from mavlink_bridge.alerts.ids import AlertId
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.launch import (
-    GIMBAL,
-    ArduPilotSitl,
-    EmbeddedSitl,
-    find_arducopter,
-    vision_only_parameters,
-)
+from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl, vision_only_parameters
 
 PROGRAM = shutil.which(os.environ.get("MAVPROXY", "mavproxy.py"))
 HOME = Location(47.397742, 8.545594, 488.0)
 ALERT = alert(AlertId.HEIGHT_MISMATCH, metres=9.0)
 TEXT = text(ALERT)
-REAL = [
-    pytest.mark.sitl,
-    pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
-]
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no mavproxy.py (MAVPROXY)")
 
 
-@pytest.fixture(params=[EmbeddedSitl, pytest.param(ArduPilotSitl, marks=REAL)])
+@pytest.fixture(params=[EmbeddedSitl, pytest.param(ArduPilotSitl, marks=pytest.mark.sitl)])
 def vehicle(request: pytest.FixtureRequest) -> Iterator[Any]:
     with request.param(HOME, parameters=GIMBAL | vision_only_parameters()) as process:
         yield process

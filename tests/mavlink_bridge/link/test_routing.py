@@ -27,13 +27,7 @@ from mavlink_bridge.alerts.words import InjectionOrder
 from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
-from sitl.vehicles.launch import (
-    GIMBAL,
-    ArduPilotSitl,
-    EmbeddedSitl,
-    find_arducopter,
-    vision_only_parameters,
-)
+from sitl.vehicles.launch import GIMBAL, ArduPilotSitl, EmbeddedSitl, vision_only_parameters
 
 PROMISED = (
     "CAMERA_TRACKING_GEO_STATUS",
@@ -43,13 +37,9 @@ PROMISED = (
 )
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID = 47.3
-REAL = [
-    pytest.mark.sitl,
-    pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
-]
 
 
-@pytest.fixture(params=[EmbeddedSitl, pytest.param(ArduPilotSitl, marks=REAL)])
+@pytest.fixture(params=[EmbeddedSitl, pytest.param(ArduPilotSitl, marks=pytest.mark.sitl)])
 def vehicle(request: pytest.FixtureRequest) -> Iterator[Any]:
     with request.param(HOME, parameters=GIMBAL | vision_only_parameters()) as process:
         yield process

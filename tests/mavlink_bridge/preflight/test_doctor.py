@@ -15,11 +15,7 @@ from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.preflight.client import ParameterClient, decode_value, encode_value
-from mavlink_bridge.preflight.doctor import (
-    check_parameters,
-    examine,
-    repair,
-)
+from mavlink_bridge.preflight.doctor import check_parameters, examine, repair
 from mavlink_bridge.preflight.failsafes import failsafes, px4_failsafes
 from mavlink_bridge.preflight.rules import (
     DoctorFinding,

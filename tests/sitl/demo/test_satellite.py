@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.inspection.kind import object_mask
@@ -37,7 +40,8 @@ def offset_m(survey: TopView, satellite: TopView, row: int, column: int, half: i
     return np.array([found[1], -found[0]]) * GSD_M
 
 
-def test_ground_stays_and_roofs_lean_away_from_the_satellite(small_assets, tmp_path):
+def test_ground_stays_and_roofs_lean_away_from_the_satellite(small_assets, tmp_path, monkeypatch):
+    monkeypatch.setattr("sitl.demo.assets.BuildOptions", partial(BuildOptions, workers=1))
     off_nadir_deg, azimuth_deg = 18.0, 240.0
     spec = SatelliteMap(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth_deg, blur_px=0.8)
     build_satellite_map(small_assets.world, small_assets.map_cache, spec, tmp_path / "map")

@@ -23,22 +23,12 @@ from mavlink_bridge.link.link import sleep_until
 from sitl.suite import runner
 from sitl.suite.case import load_cases
 from sitl.suite.runner import ReportRow, run_case, run_suite
-from sitl.vehicles.launch import find_arducopter
 from sitl.vehicles.process import VehicleKind
 
 CASES = load_cases()
 FEW = [case for case in CASES if case.ci]
 REST = [case for case in CASES if not case.ci]
-KINDS = [
-    "embedded",
-    pytest.param(
-        "ardupilot",
-        marks=[
-            pytest.mark.sitl,
-            pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
-        ],
-    ),
-]
+KINDS = ["embedded", pytest.param("ardupilot", marks=pytest.mark.sitl)]
 
 
 @cache

@@ -145,8 +145,7 @@ def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
     quiet = LoopRecord(flight([0.5] * 4), (Text(1.0, 1, 3, "EKF3 IMU0 yaw"),), (0.2,))
     assert false_alarms(quiet) == ()
     lost = replace(
-        quiet,
-        texts=(Text(1.5, 191, 4, text(alert(AlertId.GNSS_LOST, output=Output.INJECTING))),),
+        quiet, texts=(Text(1.5, 191, 4, text(alert(AlertId.GNSS_LOST, output=Output.INJECTING))),)
     )
     assert false_alarms(lost, denied=True) == ()
     assert len(false_alarms(lost)) == 1

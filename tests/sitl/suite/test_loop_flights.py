@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.synth.config import WorldConfig, look_of
 from localizer.synth.visits.visit import Visit
 from localizer.synth.world import build_visits
@@ -39,8 +40,8 @@ FLOWN = tuple(_short(case) for case in load_loop_cases() if case.ci)
 def another_place(folder: Path) -> Path:
     """Its map alone, half the work of a world: nobody flies there."""
     survey, cache = folder / "survey", folder / "survey-cache"
-    build_visits(WorldConfig(105, 400.0), {survey: Visit("survey", look_of("survey"))})
-    build_cache(survey / "tileset.json", cache)
+    build_visits(WorldConfig(105, 400.0), {survey: Visit("survey", look_of("survey"))}, 1)
+    build_cache(survey / "tileset.json", cache, BuildOptions(workers=1))
     return cache
 
 

@@ -75,20 +75,15 @@ def test_a_file_of_ones_own_adds_and_replaces(tmp_path):
         ({"colour": "red"}, "colour"),
         ({"rate_per_s": 1000}, "rate_per_s"),
         ({"kind": "xyz", "url": "https://example.org/{z}/{x}"}, "url"),
+        *((text, r"mine\.yaml") for text in ("", "[]", "sources: 3", "a: [", "\0", "sources: [3]")),
     ],
 )
 def test_what_does_not_hold_is_named(tmp_path, change, why):
     path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump({"sources": [MINE | change]}))
+    path.write_text(
+        change if isinstance(change, str) else yaml.safe_dump({"sources": [MINE | change]})
+    )
     with pytest.raises(MapFetchError, match=why):
-        load_sources((path,))
-
-
-@pytest.mark.parametrize("text", ["", "[]", "sources: 3", "a: [", "\0", "sources: [3]"])
-def test_a_file_that_is_none_is_named(tmp_path, text):
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    with pytest.raises(MapFetchError, match=r"mine\.yaml"):
         load_sources((path,))
 
 
