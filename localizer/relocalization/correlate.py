@@ -160,9 +160,7 @@ class LevelCorrelator:
         norm = [max(p.norm, 1e-9) * (2 * _LOW / n) ** 2 for p in patches]
         of = [k for k, _ in pairs]
         scores = np.empty((len(pairs), side, side), np.float32)
-        _normalised(
-            raws, energies, np.array(least, np.float32)[of], np.array(norm, np.float32)[of], scores
-        )
+        _normalised(raws, energies, *np.array([least, norm], np.float32)[:, of], scores)
         return scores
 
     def warm_up(self) -> None:
