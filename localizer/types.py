@@ -35,7 +35,7 @@ class Frame:
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8:
             raise GreyRangeError(
-                f"frame {self.sequence}: a picture of {self.image.dtype}; give 8 bits a channel, a "
+                f"frame {self.sequence}: an image of {self.image.dtype}; give 8 bits a channel, a "
                 "thermal sensor's counts stretched between what shall be black and white"
             )
         if self.image.ndim == 2:

@@ -52,7 +52,7 @@ def flight_command(
     if config is not None:
         load_config(config)
     loaded = load_record(record, 0.0, tlog, map_cache)
-    with show_count(Console(stderr=True), "pictures") as count:
+    with show_count(Console(stderr=True), "images") as count:
         found = calibrate(loaded, frames, count)
     wanted = setting_changes(loaded.config, found)
     _show_numbers(found)
@@ -64,7 +64,7 @@ def flight_command(
     for note in (*found.notes, *filter(None, (doubt,))):
         tell(escape(note), "yellow")
     tell(
-        f"{found.frames} pictures, {found.parts} of their parts: {found.before_px:.2f} px from the "
+        f"{found.frames} images, {found.parts} of their parts: {found.before_px:.2f} px from the "
         f"map with the deployment's camera, {found.after_px:.2f} px with the one found"
     )
     _show_changes(wanted)

@@ -77,7 +77,7 @@ def plan_command(
     with show_count(Console(stderr=True), "places") as count:
         plan = make_plan(planned, cache, deployment, question, count)
     camera = deployment.camera.model.camera().without_distortion()
-    with show_work(Console(stderr=True), "drawing the pictures"):
+    with show_work(Console(stderr=True), "drawing the images"):
         sheet = page.render_map_square(plan, cache)
         aim = aim_of(deployment, pitch)
         shown = (
