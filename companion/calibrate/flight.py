@@ -256,8 +256,8 @@ def _notes(evidence: CalibrationProblem, config: CompanionConfig) -> tuple[str, 
     share = float(evidence.placed.mean())
     if config.bridge.mode in _OURS:
         notes.append(
-            "the flight injected its fixes: the EKF's places are our own and were not used; fly in "
-            "shadow mode to learn lateness, lever arm and the map's place"
+            "the flight injected its fixes: its EKF's positions repeat them and were not used; fly "
+            "in shadow mode to find time offset, lever arm and map offset"
         )
     elif share < 0.5:
         notes.append(f"GNSS positions are known at {100 * share:.0f} % of the images only")

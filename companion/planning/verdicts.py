@@ -232,7 +232,7 @@ def flown_words(legs: Sequence[FlownLeg]) -> str:
     if not len(held):
         return "The flight has no frame on this mission."
     return (
-        f"Flown: {len(held)} places; the forecast is right at "
+        f"Flown: {len(held)} points; the forecast is right at "
         f"{100 * (forecast == held).mean():.0f} %; {int((forecast & ~held).sum())} failed that "
         f"should hold, {int((~forecast & held).sum())} held that should fail."
     )

@@ -57,7 +57,7 @@ def flight_command(
     wanted = setting_changes(loaded.config, found)
     _show_numbers(found)
     blind = blind_spots(found)
-    tell("What this flight cannot tell:" if blind else "This flight tells all of it.")
+    tell("This flight does not determine:" if blind else "This flight determines all.")
     for line in blind:
         tell(f"  {escape(line)}")
     doubt = loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map))
@@ -85,7 +85,7 @@ def _show_numbers(found: Any) -> None:
          "yes" if sigma <= n.useful else "no")
         for n, value, sigma in zip(UNKNOWNS, found.shared, found.sigmas, strict=True)
     ]  # fmt: skip
-    headings = ("", "differs by", "1 sigma", "unit", "told")
+    headings = ("", "differs by", "1 sigma", "unit", "determined")
     show_table(headings, rows, "against the deployment", headings[1:3])
 
 
