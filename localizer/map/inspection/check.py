@@ -359,7 +359,7 @@ def _shift(shift: ImageryOffset) -> MapFinding:
     name = "imagery on surface"
     if not shift.known:
         words = f"{shift.edges} cells with a step: too few, or they do not meet; flat land"
-        return MapFinding(name, "cannot be told", Grade.GOOD, words)
+        return MapFinding(name, "not known", Grade.GOOD, words)
     found = f"{shift.east_m:+.1f} m east, {shift.north_m:+.1f} m north (peak {shift.peak:.0f})"
     if shift.distance_m <= _SHIFT_M:
         return MapFinding(name, found, Grade.GOOD, "together, to about a metre")
