@@ -3,7 +3,7 @@
     python examples/click_to_target.py CONNECTION X Y [COUNT]
 
 CONNECTION is pymavlink's, to the vehicle or to the companion's ground link (udpin:0.0.0.0:14550,
-tcp:127.0.0.1:5763). X and Y are the place in the picture, 0 to 1 from its left and its top. Prints
+tcp:127.0.0.1:5763). X and Y are the point in the frame, 0 to 1 from its left and its top. Prints
 COUNT (5) reports. MAVLink's camera protocol v2: https://mavlink.io/en/services/camera.html
 """
 

@@ -5,7 +5,7 @@
 It opens the same camera feed as `companion run DEPLOYMENT.yaml` and sends one JSON datagram per
 frame to that deployment's `targets.detections`; formats.md describes it. Put your own network
 into `find_red`. The feed must be one that two processes can read: multicast, RTSP, a file; and its
-pictures must carry their time, so that both date them alike within 5 ms.
+frames must carry their time, so that the times of both differ by less than 5 ms.
 """
 
 from __future__ import annotations

@@ -5,13 +5,13 @@
 CONNECTION is that of messages.md (serial:/dev/ttyTHS1:921600, udpin:0.0.0.0:14551, ...). LAT,
 LON and ALTITUDE (metres above mean sea level) become the EKF's origin if it has none; GEOID is how
 far the mean sea level lies above the ellipsoid there, metres. Your localizer, in any language,
-writes a line per picture:
+writes a line per frame:
 
     {"time_ns": 81234567890, "latitude_deg": 47.39, "longitude_deg": 8.54, "height_m": 595.3,
      "quaternion": [0.707, 0, 0, 0.707], "sigma_m": 0.8}
 
 (without the line break). The fields are those of `mavlink_bridge.VisionFix`; time_ns is the
-exposure on this computer's CLOCK_MONOTONIC, the place is the vehicle's and its height is above the
+exposure on this computer's CLOCK_MONOTONIC, the position is the vehicle's, its height above the
 ellipsoid. quaternion (w, x, y, z) turns body axes to north, east, down; of a heading alone, give
 that of a level body. Leave out what you do not know. Parameters of the autopilot: `companion
 doctor`, and the table in docs/reference/messages.md. Fly it in mode "shadow" first: that compares

@@ -35,7 +35,7 @@ class Frame:
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8:
             raise GreyRangeError(
-                f"frame {self.sequence}: a picture of {self.image.dtype}; give 8 bits a channel, a "
+                f"frame {self.sequence}: an image of {self.image.dtype}; give 8 bits a channel, a "
                 "thermal sensor's counts stretched between what shall be black and white"
             )
         if self.image.ndim == 2:
@@ -220,7 +220,7 @@ def _up() -> Array:
 class TargetSurface:
     """A surface that a target's pixel may show. probability: 0 to 1; position: (3,) world metres;
     covariance: (3, 3) m², world axes, given this surface; normal: (3,) unit, world axes;
-    repeats: (3, 3) m², the part of `covariance` that is alike in all frames of one view.
+    repeats: (3, 3) m², the part of `covariance` that is the same in all frames of one view.
     """
 
     probability: float

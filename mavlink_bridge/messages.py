@@ -211,7 +211,7 @@ class TargetReport:
         for place in (self.pixel, self.rectangle):
             if place is not None and not all(0.0 <= c <= 1.0 for c in place):
                 raise FixError(
-                    f"target report: {place} is not inside the picture; give shares of its width "
+                    f"target report: {place} is not inside the image; give shares of its width "
                     "and height, 0 to 1"
                 )
 

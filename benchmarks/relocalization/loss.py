@@ -7,7 +7,7 @@ FOLDER and region: as of `benchmarks.relocalization.area`; flights, weather and 
 `benchmarks.relocalization.motion`, heading unknown, no velocity. Ten seconds into the flight, of
 which one frame a second is kept, the position is lost, and what flies begins: a search of the whole
 region, every second one with the kept frames; the next frames searched near its result; that place
-on trial in the localizer. The flight goes on for as long as each step takes on this computer, with
+tentative in the localizer. The flight goes on for as long as each step takes on this computer, with
 whatever else runs on it. Confirmed: the localizer tracks. The world is seen from 120 m above
 ground.
 """

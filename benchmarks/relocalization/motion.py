@@ -7,7 +7,7 @@
 FOLDER keeps the worlds of `python -m benchmarks.basin` and `benchmarks.integrity`. Each trial is a
 flight that knows no place, at 5 to 12 m/s, 55 to 150 m above ground, under drawn weather, seen on
 another day than the map's: up to five successive frames, half a second apart, are searched until
-one is found; the place is put on trial in the localizer that flies (`Localizer.offer`), which
+one is found; the position becomes tentative in the localizer that flies (`Localizer.offer`), which
 tracks the frames that follow, four a second, until its independent evidence confirms or refutes it.
 Even trials know a region of 100 m, odd ones search the whole map; every second pair of trials has
 the inertial way beside it. The errors of autopilot and gimbal (tilt 0.7 degrees, heading 5) stay

@@ -94,7 +94,7 @@ class BoardViews:
             v = np.clip(view.pixels[:, 1] / self._size[1] * _ROWS, 0, _ROWS - 1e-6)
             np.add.at(cells, (v.astype(int), u.astype(int)), 1)
         wanted += [
-            f"the board in the picture's {_DOWN[r]}, {_ACROSS[c]}"
+            f"the board in the image's {_DOWN[r]}, {_ACROSS[c]}"
             for r, c in np.argwhere(cells < _IN_CELL)
         ]
         tilts = np.array([view.signature[3:] * 90.0 for view in self.views]).reshape(-1, 2)
@@ -107,7 +107,7 @@ class BoardViews:
         ]
         large = [self._share(view.pixels) > _LARGE_SHARE for view in self.views]
         if sum(large) < _EACH:
-            wanted.append("the board nearer: over half of the picture")
+            wanted.append("the board nearer: over half of the image")
         if not wanted and len(self.views) < _ENOUGH:
             wanted.append(f"{_ENOUGH - len(self.views)} more views, each another one")
         return wanted
@@ -296,7 +296,7 @@ def solve_lens(views: Sequence[BoardView], width: int, height: int) -> LensEstim
     if len(views) < _LEAST_VIEWS:
         raise RecordError(
             f"{len(views)} usable views of the board; the camera's model needs {_LEAST_VIEWS}, "
-            "better 16: all over the picture, near, and tilted"
+            "better 16: all over the image, near, and tilted"
         )
     used = list(views)
     lens, errors = _fit(used, (width, height), with_k3=False)

@@ -170,7 +170,7 @@ def _chosen(
     ]  # fmt: skip
     if len(good) < _LEAST_FRAMES:
         raise RecordError(
-            f"{record.folder}: {len(good)} localized frames with their pictures; calibration needs "
+            f"{record.folder}: {len(good)} localized frames with their images; calibration needs "
             f"{_LEAST_FRAMES}, better 150: fly in shadow mode for three minutes with "
             "record.snapshot_interval_s: 1"
         )
@@ -196,7 +196,7 @@ def _chosen(
     if len(pictures) < _LEAST_FRAMES:
         raise RecordError(
             f"{record.log.path}: attitude and gimbal are known at {len(pictures)} of {len(picked)} "
-            f"pictures; calibration needs {_LEAST_FRAMES}: is it this flight's log?"
+            f"images; calibration needs {_LEAST_FRAMES}: is it this flight's log?"
         )
     return pictures, receiver_bias_m(accuracies_m)
 
@@ -206,7 +206,7 @@ def _stream_camera(record: FlightRecord, pictures: list[_ChosenFrame]) -> Camera
     for picture in pictures:
         if (frame := _read(picture, record.flight.camera.camera)) is not None:
             return frame.camera
-    raise RecordError(f"{record.folder}: none of its pictures can be read")
+    raise RecordError(f"{record.folder}: none of its images can be read")
 
 
 def _read(picture: _ChosenFrame, camera: Camera) -> Frame | None:
@@ -245,7 +245,7 @@ def _sighted(
             sighted.append(CalibrationFrame(picture.time_ns, picture.pose, parts, picture.window))
     if len(sighted) < _LEAST_FRAMES:
         raise RecordError(
-            f"only {len(sighted)} of {len(pictures)} pictures can be laid on the map again: is it "
+            f"only {len(sighted)} of {len(pictures)} images match the map again: is it "
             "the flight's own map?"
         )
     return kept, sighted
@@ -256,9 +256,9 @@ def _notes(evidence: CalibrationProblem, config: CompanionConfig) -> tuple[str, 
     share = float(evidence.placed.mean())
     if config.bridge.mode in _OURS:
         notes.append(
-            "the flight injected its fixes: the EKF's places are our own and were not used; fly in "
-            "shadow mode to learn lateness, lever arm and the map's place"
+            "the flight injected its fixes: its EKF's positions repeat them and were not used; fly "
+            "in shadow mode to find time offset, lever arm and map offset"
         )
     elif share < 0.5:
-        notes.append(f"places by GNSS are known at {100 * share:.0f} % of the pictures only")
+        notes.append(f"GNSS positions are known at {100 * share:.0f} % of the images only")
     return tuple(notes)

@@ -193,4 +193,4 @@ def _combination(vector: Array, value: float) -> str:
         only = u.UNKNOWNS[named[0]]
         sigma = size * longest * only.useful * only.scale
         return f"{only.name}: no better than {sigma:.3g} {only.unit}".rstrip()
-    return f"{', '.join(parts)} look alike, up to {size * longest:.2g} times as much"
+    return f"{', '.join(parts)} cannot be separated, up to {size * longest:.2g} times as much"

@@ -38,7 +38,7 @@ def export_command(
         written = export_mcap(record, out, tlog, lambda n: say(f"{n} rows written"))
     for note in written.notes:
         tell(f"note: {escape(note)}")
-    told = f"{written.messages} messages of {written.rows} rows, pictures and MAVLink messages"
+    told = f"{written.messages} messages of {written.rows} rows, images and MAVLink messages"
     path = escape(str(written.path))
     tell(f"{told}: [green]{path}[/]")
 
@@ -68,6 +68,5 @@ def klv_command(
             progress=tally(show),
         )  # fmt: skip
     tell(
-        f"{written.described} of {written.pictures} pictures described: "
-        f"[green]{escape(str(path))}[/]"
+        f"{written.described} of {written.pictures} frames described: [green]{escape(str(path))}[/]"
     )

@@ -82,9 +82,8 @@ _log = logging.getLogger(__name__)
 _STATIC = Path(__file__).parent / "static"
 _MOST_PAGES = 8
 _SLOWEST_S = 10.0  # a page that does not take a message for so long is left
-_UNDER_WAY = (
-    2  # pictures that a page has not yet said it showed: sockets would hold seconds of them
-)
+# Images that a page has not yet said it showed: sockets would hold seconds of them.
+_UNDER_WAY = 2
 Answer = Callable[[Request], Awaitable[Response]]
 
 

@@ -222,7 +222,7 @@ class FlightSource(ConsoleSource):
             return
         if (size := head.get("shared")) is not None:
             if not isinstance(size, int):
-                raise LinkError("a picture whose size is no number")
+                raise LinkError("an image whose size is no number")
             message = Message(head, arrivals.read(size))
             self._send({"kind": "read"})
         self.newest.add(message)

@@ -100,7 +100,7 @@ def _click_time_ns(order: dict[str, Any]) -> int:
         return now_ns
     age_s = (now_ns - _number(order, "exposure_ns", 0.0, 2.0**63)) * 1e-9
     if not -_AHEAD_S <= age_s < _OLDEST_S:
-        raise OrderError("the picture that was clicked is not of now: click into a newer one")
+        raise OrderError("the clicked frame is too old: click into a newer one")
     return min(int(order["exposure_ns"]), now_ns)
 
 

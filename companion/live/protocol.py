@@ -83,10 +83,10 @@ class SharedMemoryReader:
     def read(self, size: int) -> bytes:
         """Read `size` bytes of the shared memory. `LinkError` if there are fewer."""
         if self._file is None or not 0 <= size <= MOST_BODY:
-            raise LinkError(f"a picture of {size} bytes without memory that holds it")
+            raise LinkError(f"an image of {size} bytes without memory that holds it")
         data = os.pread(self._file, size, 0)
         if len(data) != size:
-            raise LinkError(f"a picture of {size} bytes of which {len(data)} are there")
+            raise LinkError(f"an image of {size} bytes of which {len(data)} are there")
         return data
 
     def close(self) -> None:

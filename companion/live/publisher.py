@@ -237,7 +237,7 @@ class Publisher:
                 console.memory = SharedMemory()
             size = console.memory.write(shot.parts)
         except OSError as error:  # no memory, or no descriptor: what is flown needs both more
-            _log.warning("a console cannot be given pictures and is left: %s", error)
+            _log.warning("a console cannot be given images and is left: %s", error)
             self._drop(console)
             return
         self._begin_send(console, encode(shot.head | {"shared": size}))

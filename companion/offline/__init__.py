@@ -1,1 +1,1 @@
-"""Analysis after the flight: replay and plots."""
+"""Analysis after the flight: records, replay, shadow check."""

@@ -103,7 +103,7 @@ def localize_images(
 def _why(estimate: PoseEstimate) -> str:
     if estimate.status is RegistrationStatus.OK:
         return (
-            "registered, but not believed: picture and map agree too little "
+            "registered, but rejected: image and map agree too little "
             f"(quality {estimate.quality:.2f}); check the prior, or say by --prior-sigma-m how far "
             "it may be off"
         )

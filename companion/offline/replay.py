@@ -150,7 +150,7 @@ def replay(
             frames.append(ReplayedFrame(recorded, again))
         if unzoomed:
             _log.warning(
-                "%d of %d pictures are not localized again: neither estimates.csv nor %s tells "
+                "%d of %d frames are not localized again: neither estimates.csv nor %s tells "
                 "the zoom that they were taken with", unzoomed,
                 len(record.estimates), record.log.path,
             )  # fmt: skip

@@ -176,11 +176,11 @@ class _Messages:
         else:
             local = None
         if place is None:
-            raise RecordError(f"{path}: tells no position at the time of the images")
+            raise RecordError(f"{path}: states no position at the time of the images")
         north, east, down = (0.0, 0.0, 0.0) if local is None else (local.x, local.y, local.z)
         at = offset(place.lat * 1e-7, place.lon * 1e-7, -north, -east)
         self.notes = (
-            f"{path.name} does not tell the EKF's origin: "
+            f"{path.name} does not state the EKF's origin: "
             + ("by its positions" if local is not None else "its first position stands for it"),
         )
         return next(sent_by_autopilot(0, origin_message(at, place.alt * 1e-3 + down)))[1]
@@ -273,7 +273,7 @@ class _Player:
     def result(self, notes: tuple[str, ...]) -> ShadowCheck:
         """The result of all images."""
         if not self._counts.localized:
-            notes = (*notes, f"no image was localized: {self._problem or 'no place is known'}")
+            notes = (*notes, f"no image was localized: {self._problem or 'no position is known'}")
         seconds = (self._last_ns - (self._begun_ns or self._last_ns)) * 1e-9
         held_s = {of: count * _TURN_NS * 1e-9 for of, count in self._held.most_common()}
         return replace(self._counts, seconds=seconds, held_s=held_s, notes=notes)

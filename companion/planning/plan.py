@@ -243,17 +243,17 @@ def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list
 def _notes(
     mission: PlannedMission, deployment: CompanionConfig, aim: Aim, spacing_m: float
 ) -> tuple[str, ...]:
-    notes = [f"A place every {spacing_m:.0f} m; turns are left out."]
+    notes = [f"A point every {spacing_m:.0f} m; turns are not simulated."]
     if aim.fixed:
-        notes.append("The camera is screwed on and the vehicle flown level: it leans in flight.")
+        notes.append("The camera is fixed and the vehicle assumed level: it tilts in flight.")
     elif all(w.gimbal.pitch_deg is None and w.gimbal.roi is None for w in mission.path):
-        notes.append(f"The mission moves no gimbal: taken at {aim.pitch_deg:.0f}°.")
+        notes.append(f"The mission does not move the gimbal: assumed at {aim.pitch_deg:.0f}°.")
     if mission.home is None:
-        notes.append("The mission has no home: heights are taken above its first place.")
+        notes.append("The mission has no home: heights are above its first position.")
     notes += mission.notes
     if mission.no_effect:
         names = ", ".join(sorted(mission.no_effect))
-        notes.append(f"Commands that change neither way nor view: {names}.")
+        notes.append(f"Commands that change neither path nor view: {names}.")
     if deployment.localizer.odometry is None:
         notes.append("Odometry is off in this deployment: nothing bridges a stretch.")
     return tuple(notes)

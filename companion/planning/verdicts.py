@@ -17,10 +17,9 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import GrowthModel, OdometryConfig
 
-_HILLS = (
-    0.1  # scale error over ground that is not known, mean of the first 150 m at 100 m of height
-)
-_LEAST_MAP_SHARE = 0.5  # of the picture: with less it is the map that ends
+# Scale error over ground that is not known, mean of the first 150 m at 100 m of height.
+_HILLS = 0.1
+_LEAST_MAP_SHARE = 0.5  # of the image: with less it is the map that ends
 _LIKENESS = 0.7  # of another place's match, beyond which it may be taken for this one
 
 
@@ -232,7 +231,7 @@ def flown_words(legs: Sequence[FlownLeg]) -> str:
     if not len(held):
         return "The flight has no frame on this mission."
     return (
-        f"Flown: {len(held)} places; the forecast is right at "
+        f"Flown: {len(held)} points; the forecast is right at "
         f"{100 * (forecast == held).mean():.0f} %; {int((forecast & ~held).sum())} failed that "
         f"should hold, {int((~forecast & held).sum())} held that should fail."
     )

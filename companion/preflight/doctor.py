@@ -301,7 +301,7 @@ def _check_camera(config: CompanionConfig) -> DoctorFinding:
     try:
         source = open_source(feed.source, feed.model.camera(), settings, on_state)
     except (CompanionError, LocalizerError) as error:
-        return _failed("camera", "no feed", "pictures", str(error))
+        return _failed("camera", "no feed", "frames", str(error))
     times: list[int] = []
     seen = camera = feed.model.camera()
     timer = threading.Timer(_FEED_S, source.close)
@@ -313,15 +313,15 @@ def _check_camera(config: CompanionConfig) -> DoctorFinding:
             if times[-1] - times[0] > _FEED_ENOUGH_S * 1e9:
                 break
     except (CompanionError, LocalizerError) as error:
-        return _failed("camera", "refused", "pictures of the calibrated size", str(error))
+        return _failed("camera", "refused", "frames of the calibrated size", str(error))
     finally:
         timer.cancel()
         source.close()
     if len(times) < 2:
         where = redacted(feed.source)
-        why = f"no pictures from {where} in {_FEED_S:.0f} s: "
+        why = f"no frames from {where} in {_FEED_S:.0f} s: "
         why += told[-1].removeprefix(f"{where}: ") if told else "is the stream running?"
-        return _failed("camera", "silent", "pictures", why)
+        return _failed("camera", "silent", "frames", why)
     rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
     found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"
     needed = f"{camera.width}x{camera.height}, >= {_MIN_RATE_HZ:.0f} Hz"

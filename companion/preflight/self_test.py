@@ -422,5 +422,5 @@ def _search(cache: TileCache, pose: Pose, frame: Frame, config: LocalizerConfig)
     with opened as relocalizer:
         found = relocalizer.find(query)
     if found is None:
-        raise SelfTestError("the search finds no place where it should: do not fly")
+        raise SelfTestError("the search finds no position where it should: do not fly")
     return float(np.linalg.norm(found.world_from_camera.translation - pose.translation))

@@ -212,7 +212,7 @@ _ADVICE = {
     ),
     "fixes in their bound": Advice(
         "fixes are further off than their own 95 % bound says, more often than 5 in 100",
-        "calibration and time stamps, which no single picture shows, and localizer.map_error_m",
+        "calibration and time stamps, which no single image shows, and localizer.map_error_m",
     ),
     "fixed targets in their bound": Advice(
         "coordinates of standing targets are further off than their sigma says",

@@ -27,7 +27,7 @@ LATENCY = "exposure to estimate"
 _NEWEST_FIX = "Place, sigma and elsewhere are those of each target's newest fix."
 _EVERY_FIX = (
     "The errors are of every fix while GNSS was denied, the first ones too: a maximum far beyond "
-    "the sigma is an earlier fix, often one at the picture's edge, where the ray is flat and a "
+    "the sigma is an earlier fix, often one at the image's edge, where the ray is flat and a "
     "step of the surface moves its end by metres."
 )
 

@@ -102,8 +102,8 @@ def describe_recording(
     if not described:
         out.unlink(missing_ok=True)
         raise RecordError(
-            f"{video}: no picture of it was localized in {record}; are they of one flight? Say "
-            "when its first picture was taken with --begin"
+            f"{video}: no frame of it was localized in {record}; are they of one flight? Say "
+            "when its first frame was taken with --begin"
         )
     return Written(out, pictures, described)
 

@@ -348,5 +348,5 @@ def data_uri(rgb: Image) -> str:
         ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     )
     if not done:
-        raise ReportError("a picture of the report cannot be encoded")
+        raise ReportError("an image of the report cannot be encoded")
     return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode("ascii")

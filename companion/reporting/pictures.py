@@ -111,14 +111,14 @@ def map_pictures(
     flown: the record's data about its map, to reject a map with another origin.
     """
     if path is None:
-        yield MapPictures(None, None, ["the map is not named: no pictures of it"])
+        yield MapPictures(None, None, ["the map is not named: no images of it"])
         return
     try:
         cache = TileCache.open(path)
         if flown is not None:
             flown.require_frame(cache)
     except (LocalizerError, RecordError, OSError) as error:
-        yield MapPictures(None, None, [f"no pictures of the map: {error}"])
+        yield MapPictures(None, None, [f"no images of the map: {error}"])
         return
     doubt = "" if flown is None else flown.mismatch(cache)
     streamer = TileStreamer(cache)

@@ -56,7 +56,7 @@ def read_stream_size(source: str) -> tuple[int, int]:
         timer.cancel()
         feed.close()
     why = f": {told[-1]}" if told else ""
-    raise StreamError(f"no picture in {_FIRST_PICTURE_S:.0f} s{why}")
+    raise StreamError(f"no frame in {_FIRST_PICTURE_S:.0f} s{why}")
 
 
 def deployment_text(

@@ -218,10 +218,10 @@ class VideoFileSource(FrameSource):
             _pass_exposure_time(self._taps, picture, frame.exposure_time_ns)
             yield frame
         if not self._counters.delivered:
-            raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
+            raise StreamDecodeError(f"{self._path}: no frame in it can be decoded; replace it")
         self._count(undecodable=-min(decoder.late, self._counters.undecodable))
         lost = self._counters.undecodable
-        text = f"{self._path}: end of file, {self._counters.delivered} pictures"
+        text = f"{self._path}: end of file, {self._counters.delivered} frames"
         self._report(StreamState.ENDED, text + (f", {lost} undecodable" if lost else ""))
 
     def _settle_rate(self, decoder: VideoDecoder) -> str:
@@ -232,7 +232,7 @@ class VideoFileSource(FrameSource):
         given = "rate_hz" in self._settings.model_fields_set or not stated
         self._rate_hz = self._settings.rate_hz if given else stated
         by = "by camera.settings.rate_hz" if given else "as its headers say"
-        text = f"has no times in it: {self._rate_hz:g} pictures a second, {by}"
+        text = f"has no times in it: {self._rate_hz:g} frames a second, {by}"
         _log.warning("%s: %s", self._path, text)
         return text
 
@@ -247,7 +247,7 @@ class VideoFileSource(FrameSource):
             # A damaged rest ends the file as its end would: what was before it is still good.
             self._count(undecodable=1)
             n = self._counters.delivered
-            _log.warning("%s: damaged after %d pictures: %s", self._path, n, error)
+            _log.warning("%s: damaged after %d frames: %s", self._path, n, error)
 
     def _pts_ns(self, picture: av.VideoFrame, decoder: VideoDecoder) -> int:
         stamp = _pts_ns(picture)
@@ -413,7 +413,7 @@ class LiveVideoSource(FrameSource):
             live = self._state in (StreamState.LIVE, StreamState.SCALED)
             patience_s = self._settings.stall_timeout_s if live else _OPEN_TIMEOUT_S
             if arrival_ns - self._last_picture_ns > patience_s * 1e9:
-                self._report_stall("data arrives but no picture can be decoded (no key frame yet?)")
+                self._report_stall("data arrives but no frame can be decoded (no key frame yet?)")
             return
         self._last_picture_ns = arrival_ns
         if self._input.datagrams is not None:

@@ -289,7 +289,7 @@ class VideoDatagrams:
     def _describe_unread(self) -> str:
         """What arrives but is not used, for the operator; "" for nothing."""
         if self._depacketizer is not None and self._depacketizer.is_under_way:
-            return "RTP comes, but no whole picture: packets are lost"
+            return "RTP comes, but no whole frame: packets are lost"
         if self._unread is None:
             return ""
         host, data = self._unread

@@ -185,7 +185,7 @@ class FlightProcess:
 
 
 def _beat(line: bytes) -> Beat | None:
-    """Parse a line of `companion.supervision.processes`; None for anything else."""
+    """Parse a line of `Pulse`; None for anything else."""
     part, _, age_ms = line.decode(errors="replace").partition(" ")
     return Beat(part, int(age_ms) * 1e-3) if age_ms.isdecimal() and len(age_ms) < 12 else None
 

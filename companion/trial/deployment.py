@@ -98,7 +98,7 @@ def _mount_deg(trial: Trial) -> Array:
 def _notes(trial: Trial) -> list[str]:
     notes = [
         f"Camera and mounting are those of the footage {trial.flight.name}.",
-        "CHECK camera.source and bridge.connection: the footage does not tell them.",
+        "CHECK camera.source and bridge.connection: the footage does not state them.",
         f"Focal length: {trial.flight.camera.source}.",
     ]
     if _fixed_pitch_deg(trial) is not None:

@@ -126,7 +126,7 @@ class FrameLocalizer:
         )
         found = max((one for one in tried if one), key=lambda one: one.quality, default=None)
         if found is None:
-            return Localized(name, None, searched=True, problem="no place was confirmed")
+            return Localized(name, None, searched=True, problem="no position was confirmed")
         if not prior.height_known:
             self._found_heights_m.append(float(found.world_from_camera.translation[2]))
         return Localized(name, found.world_from_camera, found.covariance, found.quality, True, True)

@@ -1,4 +1,4 @@
-"""Localizes recorded sequences by the paper's protocol (Sec. 4.1) from a perturbed prior."""
+"""Localizes recorded sequences by the paper's protocol (Sec. 4.1), and its error measures."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ The view of another day: geometry stays. Light, weather and sensor are
 `localizer.synth.appearance`'s, changes of the fine texture `localizer.synth.visits.visit`'s.
 Moved shadows and map errors are not simulated; `SIGMA` is fitted on worlds that have both.
 
-It and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its tuning worlds:
+`SIGMA` and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its tuning worlds:
 276 legs over seven, and 60 legs over three of them. Its held-out worlds were not used.
 """
 

@@ -55,7 +55,7 @@ _MODELS: dict[str, _Form | None] = {
 _READ = (
     "read are pinhole, Brown (plumb_bob, radtan), rational (rational_polynomial, FULL_OPENCV), "
     "thin_prism, tilted and fisheye (equidistant, Kannala-Brandt, OPENCV_FISHEYE); calibrate with "
-    "one of them, or give undistorted pictures and their pinhole"
+    "one of them, or give undistorted images and their pinhole"
 )
 
 
@@ -130,7 +130,7 @@ def _of_matrix(k: Sequence[float], name: str) -> dict[str, float]:
 def _of_colmap(line: re.Match[str], count: int) -> dict[str, Any]:
     """COLMAP's CAMERA_ID MODEL WIDTH HEIGHT PARAMS; first pixel's centre at 0.5, as here."""
     if count > 1:
-        raise ValueError(f"{count} cameras; leave one line, the pictures' camera")
+        raise ValueError(f"{count} cameras; leave one line, the images' camera")
     name, params = line[1], [float(x) for x in line[4].split()]
     one = name.startswith("SIMPLE") or name in ("RADIAL", "RADIAL_FISHEYE")  # focal length
     fx, fy, cx, cy, *k = [params[0], *params] if one else params

@@ -32,7 +32,7 @@ _SAME = 1e-4  # of the longer side: 0.1 px of 1000
 # cushion of a camera's lens is some 0.03.
 _MOST_OUTWARD, _MOST_INWARD = 0.25, 0.06
 _CHECK = (
-    "check the lens model's name, the order of its coefficients and the picture's size that they "
+    "check the lens model's name, the order of its coefficients and the image's size that they "
     "are of"
 )
 _WIDEST = np.radians(85.0)  # from the optical axis: beyond, a ray has no useful tangent
@@ -123,12 +123,12 @@ def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Proje
     lost = pixels[~((off < _SAME * max(size)) & _upright(seen[:, :2]))]
     if len(lost) and np.isnan(seen).any():
         return (
-            f"the picture shows more than {np.degrees(_WIDEST):.0f} degrees from the optical axis; "
+            f"the image shows more than {np.degrees(_WIDEST):.0f} degrees from the optical axis; "
             f"crop it, or {_CHECK}"
         )
     if len(lost):
         return (
-            f"the distortion cannot be undone on {len(lost) / len(pixels):.0%} of the picture, as "
+            f"the distortion cannot be undone on {len(lost) / len(pixels):.0%} of the image, as "
             f"at {lost[0][0]:.0f}, {lost[0][1]:.0f} px; {_CHECK}. If all are right, calibrate "
             "again with fewer coefficients: one too many (k3) folds the corners"
         )
@@ -142,7 +142,7 @@ def fault(size: tuple[int, int], rays: Callable[[Array], Array], project: _Proje
         bow = float(max(away, key=abs)) / float(np.linalg.norm(end - begin))
         if not -_MOST_INWARD <= bow <= _MOST_OUTWARD:
             return (
-                f"the distortion bends a straight line along the picture's edge by {abs(bow):.0%} "
+                f"the distortion bends a straight line along the image's edge by {abs(bow):.0%} "
                 f"of its length, more than a lens does; {_CHECK}"
             )
     return ""

@@ -3,8 +3,8 @@
 A sum of hypotheses (Alspach and Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
 approximations"), one for each surface; hypotheses of different surfaces are never averaged. Each is
 an interacting-multiple-model filter (Blom and Bar-Shalom 1988) of a target that stands, of one with
-constant velocity, and of one that changes it. The error of the pose is alike in neighbouring views,
-so it is a state too: many frames of one view do not claim more than its pose allows.
+constant velocity, and of one that changes it. The error of the pose is correlated in neighbouring
+views, so it is a state too: many frames of one view do not claim more than its pose allows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LASTS_S = np.array([60.0, 30.0, 2.0])
 _ACCELERATION = ((0.0, 0.0, 0.0), (0.45, 0.45, 0.02), (100.0, 100.0, 0.02))
 _STANDING, _MOVING = 0, slice(1, 3)
 _SPEED_SIGMA = (10.0, 10.0, 2.0)  # m/s, of a target that begins to move
-_ALIKE = np.radians(3.0)  # turn of the view after which its error is a third alike
+_DECORRELATES = np.radians(3.0)  # turn of the view that reduces its error's correlation to 1/e
 _SAME_VIEW = float(np.cos(np.radians(4.0)))  # what is wrong with the map's edges stays the same
 _GATE = 25.0  # chi-square of 2 dimensions: 1 in 300,000 is beyond
 _MISSED = 1e-3  # likelihood of a pixel that shows something else
@@ -41,7 +41,7 @@ _NEGLIGIBLE = 1e-8
 _MOST = 6
 _SAME = 1.0  # squared Mahalanobis distance below which two hypotheses are one
 _ELSEWHERE = 9.0  # and above which one is another place than the reported one
-_FAR_M = 300.0  # sigma of what a ray alone does not tell
+_FAR_M = 300.0  # sigma of the distance along a ray alone
 _GRAZING = 0.05  # cosine: what is seen at less than 3 degrees is met at its middle
 # The state: position m, velocity m/s, and the view's error m.
 _P, _V, _E = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -218,10 +218,10 @@ def _compared(new: _Hypothesis, best: _Hypothesis, eyes: Collection[Array]) -> _
         d = (best.position - eye) / np.linalg.norm(best.position - eye)
         S = new.covariance + best.covariance + _FAR_M**2 * np.outer(d, d)
         farthest = max(farthest, float(offset @ np.linalg.solve(S, offset)))
-    alike = float(np.exp(-0.5 * farthest * best.models.mu[_STANDING]))
+    agreement = float(np.exp(-0.5 * farthest * best.models.mu[_STANDING]))
     return replace(
         new,
-        likelihood=best.likelihood * max(alike, _MISSED),
+        likelihood=best.likelihood * max(agreement, _MISSED),
         shares=(0.0,) * (len(best.shares) - 1) + new.shares,
         sight=_UNSEEN ** (len(eyes) - 1),
     )
@@ -244,8 +244,8 @@ def _predicted(h: _Hypothesis, elapsed_s: float, turn: float) -> _Hypothesis:
         model.F, model.Q = np.eye(9), np.zeros((9, 9))
         model.F[_P, _V] = elapsed_s * np.eye(3)
         model.Q[:6, :6] = np.kron(Q_continuous_white_noise(2, elapsed_s), np.diag(density))
-        alike = 0.0 if any(density) else float(np.exp(-turn / _ALIKE))
-        model.F[_E, _E], model.Q[_E, _E] = alike * np.eye(3), (1.0 - alike**2) * h.repeats
+        kept = 0.0 if any(density) else float(np.exp(-turn / _DECORRELATES))
+        model.F[_E, _E], model.Q[_E, _E] = kept * np.eye(3), (1.0 - kept**2) * h.repeats
     standing = models.filters[_STANDING]
     standing.F[:, _V], standing.Q[_V, _V] = np.zeros((9, 3)), np.diag(np.square(_SPEED_SIGMA))
     models.predict()
@@ -274,15 +274,15 @@ def _met(h: _Hypothesis, sighting: _Sighting) -> _Hypothesis:
     off = float((nearest.position - h.position) @ d)
     if off**2 <= _GATE * float(d @ (nearest.covariance + models.P[_P, _P]) @ d):
         across = _FAR_M**2 * np.eye(3) - along
-        known, told = (
+        known, measured = (
             float(d @ models.filters[_STANDING].P[_P, _P] @ d),
             float(d @ nearest.covariance @ d),
         )
         for k, model in enumerate(models.filters):
             if k == _STANDING:
-                if told >= known:
+                if measured >= known:
                     continue
-                model.R = across + np.outer(d, d) * told * known / (known - told)
+                model.R = across + np.outer(d, d) * measured * known / (known - measured)
             else:
                 model.R = nearest.covariance + across
             model.update(nearest.position)

@@ -108,7 +108,7 @@ class TargetTrack:
         else:
             why = TargetRefusal(RefusalReason.ELSEWHERE)
         if why and self._last.fix is None and why.reason is not RefusalReason.UNCONFIRMED:
-            # Nothing was told yet, so nothing speaks for what was seen before rather than for this.
+            # Nothing was reported yet: earlier observations have no precedence over this one.
             self._begin_anew()
             self._filter.update(eye, d, surfaces, time_ns)
         return self._refuse(why) if why else fix

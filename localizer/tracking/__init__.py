@@ -1,1 +1,1 @@
-"""Processing of frames: reference rendering, localization, engine, motion, acceptance."""
+"""Processing of frames: reference rendering, localization, engine, motion filter, states."""

@@ -85,7 +85,7 @@ def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc
     ElementTree.SubElement(detail, "contact", callsign=f"TGT{report.target_id:04d}")
     if report.elsewhere >= _TOLD_ELSEWHERE:
         remarks = ElementTree.SubElement(detail, "remarks")
-        remarks.text = f"{report.elsewhere:.0%} likely on another surface (edge in the picture)"
+        remarks.text = f"{report.elsewhere:.0%} likely on another surface (edge in the image)"
     if report.velocity_ned is not None:
         north, east, _ = report.velocity_ned
         course = math.degrees(math.atan2(east, north)) % 360.0

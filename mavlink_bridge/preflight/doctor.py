@@ -67,9 +67,6 @@ class Diagnosis:
         return tuple(f for f in self.findings if not f.ok and f.fix is not None)
 
 
-# --- examinations -----------------------------------------------------------------------------
-
-
 def check_parameters(rules: Iterable[ParameterRule], read: Read) -> list[DoctorFinding]:
     """Compare parameters with each rule. read: gives a value, None if it does not exist."""
     findings = []

@@ -53,7 +53,7 @@ class ErrorSpec(StrictModel):
     distortion: float = Field(0.003, ge=0, le=0.1, description="of k1; k2 as much, p1, p2 a tenth")
     lever_arm_m: float = Field(0.05, ge=0, le=2, description="camera to autopilot, per axis")
     stamp_offset_ms: float = Field(3.0, ge=0, le=200, description="of the camera's clock")
-    stamp_jitter_ms: float = Field(2.0, ge=0, le=100, description="from picture to picture")
+    stamp_jitter_ms: float = Field(2.0, ge=0, le=100, description="from frame to frame")
     readout_ms: float = Field(1.0, ge=0, le=20, description="of the shutter's readout time")
     map_shift_m: tuple[Shift, Shift] = Field(
         (0.3, 1.5), description="least and most that the map lies beside GNSS, horizontally"

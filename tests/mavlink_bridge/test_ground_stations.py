@@ -61,7 +61,7 @@ def test_every_event_passes_the_published_schema_and_a_broken_one_does_not():
     for event in events:
         schema.assertValid(etree.fromstring(event))
     remarks = [etree.fromstring(event).findtext("detail/remarks") for event in events]
-    assert remarks == ["20% likely on another surface (edge in the picture)", None, None, None]
+    assert remarks == ["20% likely on another surface (edge in the image)", None, None, None]
     for broken in (b'lat="-33', b'stale="2', b'version="2.0"'):
         assert broken in events[0]
         wrong = events[0].replace(

@@ -52,19 +52,19 @@ def flight_command(
     if config is not None:
         load_config(config)
     loaded = load_record(record, 0.0, tlog, map_cache)
-    with show_count(Console(stderr=True), "pictures") as count:
+    with show_count(Console(stderr=True), "images") as count:
         found = calibrate(loaded, frames, count)
     wanted = setting_changes(loaded.config, found)
     _show_numbers(found)
     blind = blind_spots(found)
-    tell("What this flight cannot tell:" if blind else "This flight tells all of it.")
+    tell("This flight does not determine:" if blind else "This flight determines all.")
     for line in blind:
         tell(f"  {escape(line)}")
     doubt = loaded.tables.flown_map.mismatch(TileCache.open(loaded.config.map))
     for note in (*found.notes, *filter(None, (doubt,))):
         tell(escape(note), "yellow")
     tell(
-        f"{found.frames} pictures, {found.parts} of their parts: {found.before_px:.2f} px from the "
+        f"{found.frames} images, {found.parts} of their parts: {found.before_px:.2f} px from the "
         f"map with the deployment's camera, {found.after_px:.2f} px with the one found"
     )
     _show_changes(wanted)
@@ -85,7 +85,7 @@ def _show_numbers(found: Any) -> None:
          "yes" if sigma <= n.useful else "no")
         for n, value, sigma in zip(UNKNOWNS, found.shared, found.sigmas, strict=True)
     ]  # fmt: skip
-    headings = ("", "differs by", "1 sigma", "unit", "told")
+    headings = ("", "differs by", "1 sigma", "unit", "determined")
     show_table(headings, rows, "against the deployment", headings[1:3])
 
 

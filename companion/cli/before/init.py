@@ -76,7 +76,7 @@ def init_command(
         fov = _ask("horizontal field of view, degrees", "--camera or --fov", _DEFAULT_FOV_DEG)
     size = None
     if listen:
-        with show_work(Console(stderr=True), f"waiting for a picture of {redacted(feed)}"):
+        with show_work(Console(stderr=True), f"waiting for a frame of {redacted(feed)}"):
             size = _stream_size(feed, notes)
     placed = feed if "://" in feed else str(Path(feed).resolve())
     settings["camera"] = {"source": placed, "model": _model(camera, fov, size, notes)}
@@ -152,7 +152,7 @@ def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
     try:
         width, height = read_stream_size(feed)
     except (CompanionError, LocalizerError) as error:
-        notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
+        notes.append(f"the stream {redacted(feed)} gave no frame ({error}): check width, height")
         return None
     typer.echo(f"stream: {width}x{height}")
     return width, height

@@ -72,5 +72,5 @@ def check_command(
         tell("No part of it is usable.")
     elif bad or not made.usable.is_whole:
         tell(f"Usable without a gap: {made.usable.line()}; keep what the camera sees inside it.")
-    tell(f"Pictures: {escape(str(out))}")
+    tell(f"Images: {escape(str(out))}")
     raise typer.Exit(0 if made.ok else 1)

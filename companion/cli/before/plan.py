@@ -74,10 +74,10 @@ def plan_command(
         Question(mission, conditions, MissionLimits(sigma)),
         spacing_m=spacing, speed_m_s=speed, pitch_deg=pitch, seek=alternatives,
     )  # fmt: skip
-    with show_count(Console(stderr=True), "places") as count:
+    with show_count(Console(stderr=True), "points") as count:
         plan = make_plan(planned, cache, deployment, question, count)
     camera = deployment.camera.model.camera().without_distortion()
-    with show_work(Console(stderr=True), "drawing the pictures"):
+    with show_work(Console(stderr=True), "drawing the images"):
         sheet = page.render_map_square(plan, cache)
         aim = aim_of(deployment, pitch)
         shown = (

@@ -79,7 +79,7 @@ export class VideoView {
 
   tellAge(head, arrived) {
     if (head.exposure_utc_ms === null) {
-      this.$("video-age").textContent = "a kept picture, the newest before this moment";
+      this.$("video-age").textContent = "a kept frame, the newest before this moment";
       return;
     }
     const shown = Date.now();

@@ -58,7 +58,7 @@ def layout_of(
     if len(fits) != 1:
         names = ", ".join(get_args(Layout))
         raise DetectorError(
-            f"an output of shape {shape} for pictures of {size[0]}x{size[1]}"
+            f"an output of shape {shape} for images of {size[0]}x{size[1]}"
             + (f" and {classes} classes" if classes is not None else "")
             + f" fits {len(fits)} layouts: set targets.detector.layout to one of {names}"
         )

@@ -34,7 +34,7 @@ class DetectorNetwork:
         given = self._session.get_inputs()
         if len(given) != 1 or len(given[0].shape) != 4 or given[0].shape[1] not in (3, "3"):
             shapes = ", ".join(f"{i.name} {i.shape}" for i in given)
-            raise DetectorError(f"{config.model}: takes {shapes}, not one picture (1, 3, H, W)")
+            raise DetectorError(f"{config.model}: takes {shapes}, not one image (1, 3, H, W)")
         if given[0].type != "tensor(float)":
             raise DetectorError(f"{config.model}: takes {given[0].type}, not tensor(float)")
         self._input = given[0].name

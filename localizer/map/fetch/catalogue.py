@@ -121,7 +121,7 @@ class CatalogueSource(BaseModel):
             if not all(part in self.url for part in ("{z}", "{x}", "{y}")):
                 raise ValueError("url: {z}, {x} and {y} stand in it")
             if self.role != "imagery":
-                raise ValueError(f"role: {self.kind} gives pictures only")
+                raise ValueError(f"role: {self.kind} gives imagery only")
         try:
             CRS(self.crs)
         except CRSError as error:

@@ -241,7 +241,7 @@ def require_8_bits(name: str, dtype: str) -> None:
     """`MapFetchError` for images of more than 8 bits, whose value range is unknown."""
     if dtype != "uint8":
         raise MapFetchError(
-            f"{name} has pixels of {dtype}, no picture of 8 bits; ask for another layer or "
+            f"{name} has pixels of {dtype}, no image of 8 bits; ask for another layer or "
             "`format`, or scale it with `gdal_translate -ot Byte -scale`"
         )
 

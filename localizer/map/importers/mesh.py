@@ -107,7 +107,7 @@ def obj_materials(path: Path) -> tuple[dict[str, MtlMaterial], tuple[str, ...]]:
         if unknown:
             doubts.append(
                 f"{len(unknown)} of its materials are in no library (newmtl), first "
-                f"{unknown[0]!r}: their faces have no picture"
+                f"{unknown[0]!r}: their faces have no image"
             )
         if len(found) > 1 and not _names_first_face(text):
             doubts.append(

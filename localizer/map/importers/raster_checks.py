@@ -192,7 +192,7 @@ def check_colours(path: Path, data: DatasetReader, bands: tuple[int, int, int]) 
         return []
     colour = ", ".join(str(int(level)) for level in np.median(colours, axis=0))
     return [
-        f"{path.name}: shows one colour ({colour}) all over: no picture can be registered against "
+        f"{path.name}: shows one colour ({colour}) all over: no image can be registered against "
         "it; is it the right file, and were its bands exported?"
     ]
 

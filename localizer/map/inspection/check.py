@@ -287,19 +287,19 @@ def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> MapFinding:
     found = f"{100 * share:.2f} % of the area"
     if share > _MOST_BLANK:
         words = (
-            "surface without a picture (plain white or black, or a colour without a texture): the "
+            "surface without imagery (plain white or black, or a colour without a texture): the "
             "source lacks imagery there"
         )
-        return MapFinding("without picture", found, Grade.BAD, words)
+        return MapFinding("without imagery", found, Grade.BAD, words)
     if (flat := _flat_share(mosaic)) > _MOST_FLAT:
-        words = "plain colours: the picture shows nothing to match"
-        return MapFinding("without picture", f"{100 * flat:.0f} % of the area", Grade.BAD, words)
-    return MapFinding("without picture", found, Grade.GOOD, "as it should be")
+        words = "plain colours: the imagery shows nothing to match"
+        return MapFinding("without imagery", f"{100 * flat:.0f} % of the area", Grade.BAD, words)
+    return MapFinding("without imagery", found, Grade.GOOD, "as it should be")
 
 
 def _sharpness(cache: TileCache, kind: MapKind, use: MapUse) -> list[MapFinding]:
     if not len(_leaf_gsd(cache)) and not cache.manifest.gsd_m:
-        return [MapFinding("texel size", "none", Grade.BAD, "no tile has a picture")]
+        return [MapFinding("texel size", "none", Grade.BAD, "no tile has imagery")]
     return [_texels(cache, use), _detail(kind, use)]
 
 
@@ -319,7 +319,7 @@ def _texels(cache: TileCache, use: MapUse) -> MapFinding:
 def _heights_finding(kind: MapKind, use: MapUse) -> MapFinding:
     advice = kind.advice(use.half_view_deg, use.height_m)
     grade = Grade.ADVICE if advice else Grade.GOOD
-    words = advice or "they tell a tilt from a shift"
+    words = advice or "they distinguish tilt from shift"
     return MapFinding("heights", HEIGHTS_HOLD[kind.heights], grade, words)
 
 
@@ -356,15 +356,15 @@ def _seam_finding(seams: list[Seam]) -> MapFinding:
 
 
 def _shift(shift: ImageryOffset) -> MapFinding:
-    name = "picture on surface"
+    name = "imagery on surface"
     if not shift.known:
         words = f"{shift.edges} cells with a step: too few, or they do not meet; flat land"
-        return MapFinding(name, "cannot be told", Grade.GOOD, words)
+        return MapFinding(name, "not known", Grade.GOOD, words)
     found = f"{shift.east_m:+.1f} m east, {shift.north_m:+.1f} m north (peak {shift.peak:.0f})"
     if shift.distance_m <= _SHIFT_M:
         return MapFinding(name, found, Grade.GOOD, "together, to about a metre")
     words = (
-        f"the picture lies {shift.distance_m:.1f} m beside its surface: roofs are painted on the "
+        f"the imagery lies {shift.distance_m:.1f} m beside its surface: roofs are painted on the "
         "ground. Check the CRS of orthophoto and surface, or take a true orthophoto"
     )
     return MapFinding(name, found, Grade.BAD, words)

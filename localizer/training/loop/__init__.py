@@ -1,1 +1,1 @@
-"""The training loop, its losses and what it saves."""
+"""The training loop."""

@@ -1,13 +1,13 @@
 """The `tiny` network: MobileOne blocks in the encoder, an additive U-Net decoder, three levels.
 
 Each level gives unit-length features and a confidence in (0, 1), the complement of the paper's
-uncertainty (Sec. 3.3.1, A.1). Eight channels are fixed orientation energy (`orientation`), the rest
-is learned; what share each has in the squared distance is learned too, pixel by pixel, because
-orientation does not last on grass, leaves and water. The confidence is the
-orientation's clarity: one that was learned with the features gathered the anchors in a few places
-and cost accuracy each time it was tried (model-card.md). The finest level is at stride 2: half
-the paper's, a quarter of the work. The coarsest stage is dilated, because at stride 8 a wide field
-of view costs next to nothing.
+uncertainty (Sec. 3.3.1, A.1). Eight channels are fixed orientation energy (`OrientationFeatures`),
+the rest is learned; what share each has in the squared distance is learned too, pixel by pixel,
+because orientation does not last on grass, leaves and water. The confidence is the orientation's
+clarity: one that was learned with the features gathered the anchors in a few places and cost
+accuracy each time it was tried (model-card.md). The finest level is at stride 2: half the paper's,
+a quarter of the work. The coarsest stage is dilated, because at stride 8 a wide field of view costs
+next to nothing.
 
 The orientation features (`orientation_level` in torch) give the network a sound basin from the
 first step on, so that what is learned is what they lack: what survives a change of season and

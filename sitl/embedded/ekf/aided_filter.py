@@ -1,4 +1,4 @@
-"""Sensor source selection of the EKF, and start and end of aiding, as in EKF3 4.7.
+"""The EKF's gates, sensor source selection, and start and end of aiding, as in EKF3 4.7.
 
 Without aiding for 7 s (10 s with velocity) the position flag ends; after 15 s aiding ends. A jump
 is accepted at once only if it is announced.

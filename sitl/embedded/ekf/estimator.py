@@ -2,7 +2,7 @@
 
 It runs at a delayed time horizon (up to 250 ms back) so that late measurements meet the state of
 their own time, and carries the result to the present through the buffered IMU increments. What is
-fused, and when it is believed, is in `aided_filter` and `gated_filter`.
+fused, and when it is accepted, is in `aided_filter`.
 """
 
 from __future__ import annotations

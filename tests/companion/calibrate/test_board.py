@@ -156,7 +156,7 @@ def test_the_command_reads_a_folder_and_changes_the_deployment(tmp_path):
     ]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
-    assert "missing: the board in the picture" in done.output
+    assert "missing: the board in the image" in done.output
     after = load_config(path).camera.model
     assert (after.width, after.height) == (640, 480)
     assert after.fx == pytest.approx(TRUE.fx, rel=0.01)

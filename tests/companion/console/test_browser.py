@@ -158,7 +158,7 @@ def test_the_views_are_reached_by_keyboard(page):
 def test_a_record_is_shown_with_the_maps_view_and_a_time_bar(replay):
     page, seen = replay
     _until(page, lambda: (page.evaluate("window.consoleFrames") or 0) > 0)
-    assert "kept picture" in page.inner_text("#video-age")
+    assert "kept frame" in page.inner_text("#video-age")
     assert "doctor" not in _views(page)  # nothing to examine
     page.click("#play")
     page.evaluate(

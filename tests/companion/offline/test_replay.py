@@ -340,7 +340,7 @@ def test_an_older_record_of_a_camera_that_zooms_is_replayed_by_its_log_or_told(
     monkeypatch.setattr(RecordedAutopilot, "zoom_at", zoom_at)
     assert replayed(ZoomTable(points=((0, 1), (100, 4)), hold_s=5.0)) == list(old)
     assert seen == pytest.approx([1.0] * 2 + [2.0] * (len(old) - 3), rel=1e-3)
-    assert f"1 of {len(old)} pictures are not localized again" in caplog.text
+    assert f"1 of {len(old)} frames are not localized again" in caplog.text
     assert replayed(None) == list(old)  # false alarm: a camera that does not zoom
     assert seen == pytest.approx([1.0] * len(old))
     assert not caplog.records

@@ -88,7 +88,7 @@ def test_a_raw_stream_plays_at_its_own_rate_or_the_given_one(tmp_path, codec, se
     np.testing.assert_allclose(steps, 1e9 / rate, atol=1e3)
     assert len(steps) == COUNT - 1
     by = "camera.settings.rate_hz" if settings else "its headers"
-    assert f"no times in it: {rate} pictures a second" in told[0]
+    assert f"no times in it: {rate} frames a second" in told[0]
     assert by in told[0]
 
 

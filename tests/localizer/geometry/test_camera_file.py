@@ -102,7 +102,7 @@ def test_a_lens_is_read_whole(tmp_path, data, model, distortion):
         ({"camera_matrix": [[500, 2, 320], [0, 500, 240], [0, 0, 1]]}, "without skew"),
         # The rational lens of above, cut to five.
         ({"distortion": RATIONAL[:5]}, "bends a straight line .* by 10% of its length"),
-        ({"distortion": [-0.9, 0, 0, 0, 0]}, "cannot be undone on .*% of the picture"),
+        ({"distortion": [-0.9, 0, 0, 0, 0]}, "cannot be undone on .*% of the image"),
         ({"distortion": [0, 0, 0.3, 0.1, 0]}, "the order of its coefficients"),
         ({"model": "fisheye", "fx": 200.0, "fy": 200.0}, "more than 85 degrees"),
     ],

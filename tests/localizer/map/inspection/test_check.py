@@ -173,13 +173,13 @@ def test_a_map_of_colours_has_no_picture(tmp_path, make):
     green = [{"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.5, 0.1, 1]}}]
     made = built_from(tmp_path / "a", make, materials=green)
     del made["usable"]
-    assert {n for n, f in made.items() if f.grade is Grade.BAD} == {"without picture", "texel size"}
+    assert {n for n, f in made.items() if f.grade is Grade.BAD} == {"without imagery", "texel size"}
     assert "imagery detail" not in made
-    assert made["without picture"].found.startswith("100.00 %")
+    assert made["without imagery"].found.startswith("100.00 %")
     plain = cv2.imencode(".png", np.full((64, 64, 3), (40, 120, 60), np.uint8))[1].tobytes()
     made = built_from(tmp_path / "b", make, image=plain)
-    assert made["without picture"].grade is Grade.BAD
-    assert built_from(tmp_path / "c", make)["without picture"].grade is Grade.GOOD
+    assert made["without imagery"].grade is Grade.BAD
+    assert built_from(tmp_path / "c", make)["without imagery"].grade is Grade.GOOD
 
 
 def test_a_working_pixel_finer_than_the_detail_is_named_with_the_width_that_is_not(cache):
