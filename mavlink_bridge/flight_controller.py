@@ -30,8 +30,7 @@ from mavlink_bridge.vehicle.profile import select_profile
 from mavlink_bridge.vehicle.readings import MESSAGES_IN
 from mavlink_bridge.vehicle.streams import StreamKeeper
 from mavlink_bridge.vehicle.timesync import TimeSync
-from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
-from mavlink_bridge.vehicle_events import VehicleEvents
+from mavlink_bridge.vehicle_events import UnexpectedSenderMonitor, VehicleEvents
 
 _FIRST_GUESS = 1  # the system id that vehicles are delivered with
 _IDLE_NS = 100_000_000

@@ -51,10 +51,10 @@ def _missed(axes: Axes, results: dict[str, Kept]) -> None:
         colors = ["tab:red" if share > 1 else "tab:blue" for share in shares]
         axes.scatter(shares, [row] * len(shares), c=colors, alpha=0.6)
         missed = sum(share > 1 for share in shares)
-        axes.text(1.72, row, f"{missed} of {len(shares)} missed", va="center")
+        axes.text(1.8, row, f"{missed} of {len(shares)} missed", va="center")
     axes.axvline(1.0, color="black", linewidth=1)
     axes.set_yticks(range(len(_CRITERIA)), list(_CRITERIA.values()))
-    axes.set_xlim(0, 2.1)
+    axes.set_xlim(0, 2.25)
     axes.set_xlabel("found / allowed (1 / that where more is better); one dot a flight")
 
 

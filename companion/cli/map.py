@@ -218,7 +218,7 @@ def info(
         result_file(geojson, "--geojson", (".geojson", ".json"))
     if kml is not None:
         result_file(kml, "--kml", (".kml",))
-    from localizer.geometry.antimeridian import geo_box
+    from localizer.geometry.geo import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import as_geojson, as_kml, levels

@@ -13,7 +13,7 @@ import typer
 
 from companion.cli.output import end_at_once
 from companion.config import CompanionConfig
-from companion.supervision.restart import keep_settings, settings_of
+from companion.supervision.processes import keep_settings, settings_of
 from companion.terminal.console_log import console_log
 from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice

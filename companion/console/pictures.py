@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from companion.live.protocol import Message
-from localizer.geometry.antimeridian import lon_near
 from localizer.geometry.camera import Camera
+from localizer.geometry.geo import lon_near
 from localizer.geometry.pose import Pose, matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer

@@ -21,8 +21,7 @@ from companion.flight.components import Assembly, Component
 from companion.flight.health import HealthMonitor
 from companion.flight.recorder import RecordKeeper
 from companion.integrity_monitor.integrity_monitor import IntegrityMonitor
-from companion.supervision.processes import Pulse
-from companion.supervision.restart import without_lost_disks
+from companion.supervision.processes import Pulse, without_lost_disks
 from localizer.errors import LocalizerError
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack

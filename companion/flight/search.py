@@ -21,8 +21,10 @@ from localizer.geometry.geo import EARTH_RADIUS_M
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.pictures import shrink
+from localizer.relocalization.patch import with_heading
 from localizer.relocalization.relocalizer import SEARCH_WIDTH, OpenRelocalizer, open_relocalizer
 from localizer.relocalization.types import EarlierFrame, PlaceQuery, Relocalization, SearchRegion
+from localizer.relocalization.verify import attitude_difference
 from localizer.sensors.error_model import SENSORS
 from localizer.types import Frame, PosePrior
 from mavlink_bridge.alerts.ids import AlertId
@@ -48,7 +50,7 @@ _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 2.0, math.radians(1.0)  # of a found place, a
 # this, a place found is no place to begin at: a second search, of the newest frame, looks for it
 # about there, which takes a tenth.
 _STALE_M = 5.0
-_SPEED_SIGMA_M_S, _UNKNOWN_SPEED_M_S = 2.0, 8.0  # with the EKF's velocity, and without
+_SPEED_SIGMA_M_S, _UNKNOWN_SPEED_M_S = 2.0, 15.0  # with the EKF's velocity, and without
 _FOLLOWED_M, _LONGEST_S = 10.0, 120.0
 _LATE_S = 10.0  # after which attitude, height and mean velocity of then say less
 _MOST_MISSES = 3  # of one place: 100 km² take most of a minute, a look about a place a second
@@ -97,11 +99,13 @@ class RelocalizationHypothesis:
             if 0.0 < grown_m <= sigma_m and np.linalg.norm(by_imu) <= sigma_m:
                 way, sigma_m = by_imu, grown_m
         pose = self.found.world_from_camera
-        turn = query.rotation @ self.query.rotation.T
+        # The turn since is about the autopilot's axes, which an unknown heading turns against ours.
+        _, heading = attitude_difference(pose.rotation, self.query.rotation)
+        turn = query.rotation @ self.query.rotation.T @ with_heading(pose.rotation, -heading)
         late = max(1.0, elapsed_s / _LATE_S)
         return replace(
             query,
-            rotation=turn @ pose.rotation,
+            rotation=with_heading(turn, heading),
             tilt_sigma_rad=min(late * _FOLLOWED_TILT_RAD, _TILT_SIGMA_RAD),
             heading_sigma_rad=min(late * _FOLLOWED_HEADING_RAD, _HEADING_SIGMA_RAD),
             height_m=float(pose.translation[2]) + query.height_m - self.query.height_m,

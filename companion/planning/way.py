@@ -20,13 +20,11 @@ from companion.geometry import (
     world_from_camera,
 )
 from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
-from localizer.geometry.antimeridian import geo_box
-from localizer.geometry.geo import EARTH_RADIUS_M
+from localizer.geometry.geo import EARTH_RADIUS_M, geo_box
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.pick import MapSurface
-from mavlink_bridge.mission.gimbal import GimbalTarget, RegionOfInterest
-from mavlink_bridge.mission.items import LoiterCircle
+from mavlink_bridge.mission.items import GimbalTarget, LoiterCircle, RegionOfInterest
 
 LEAST_LEG_M = 1.0  # shorter ones are climbs on the spot
 # A ray that falls just between two tiles may miss both: some beside it do not.

@@ -15,7 +15,7 @@ from companion.preflight.map_pin import readable_map_hash
 from companion.versions import versions
 from companion.writing import write_result
 from localizer.errors import LocalizerError
-from localizer.geometry.antimeridian import geo_box
+from localizer.geometry.geo import geo_box
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.kind import map_kind
 from mavlink_bridge.preflight.doctor import Diagnosis

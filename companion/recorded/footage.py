@@ -29,11 +29,12 @@ from companion.recorded.flight import (
 from companion.recorded.klv_video import read_klv
 from companion.recorded.photo_tags import (
     PHOTO_SUFFIXES,
+    PLACES_SUFFIXES,
     RAW_SUFFIXES,
     PhotoTags,
     read_photo_tags,
+    read_places,
 )
-from companion.recorded.places_file import PLACES_SUFFIXES, read_places
 from companion.recorded.sequence import is_sequence, read_sequence
 from companion.recorded.video import (
     VIDEO_SUFFIXES,

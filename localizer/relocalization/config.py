@@ -11,7 +11,7 @@ class RelocalizationConfig:
 
     threads: int = 2  # CPU threads of a search, which runs while no position is known
     cache_mib: int = 128  # resident tiles, MiB
-    spectra_mib: int = 256  # map transforms kept between searches, MiB
+    spectra_mib: int = 192  # map transforms kept between searches, MiB
     # A patch of 130 m is blurred by two cells at its edge when it is turned by 3 degrees or scaled
     # by 5 %: with 10 degrees, 1.15 and 170 m the right place fell from first to behind 60th.
     heading_step_deg: float = 6.0  # step between headings

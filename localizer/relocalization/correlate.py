@@ -126,7 +126,8 @@ class LevelCorrelator:
 
     def correlate(self, patch: PatchSpectra, block: Block, apart: int = ORIGIN_CELLS) -> Float32:
         """Scores (n, n) of the patch at every `apart`th origin of the block."""
-        return self.correlate_all([patch], [(0, block)], apart)[0]
+        scores: Float32 = self.correlate_all([patch], [(0, block)], apart)[0]
+        return scores
 
     def correlate_all(
         self,
@@ -159,7 +160,7 @@ class LevelCorrelator:
         norm = [max(p.norm, 1e-9) * (2 * _LOW / n) ** 2 for p in patches]
         of = [k for k, _ in pairs]
         scores = np.empty((len(pairs), side, side), np.float32)
-        _normalised(raws, energies, np.float32(least)[of], np.float32(norm)[of], scores)
+        _normalised(raws, energies, *np.array([least, norm], np.float32)[:, of], scores)
         return scores
 
     def warm_up(self) -> None:

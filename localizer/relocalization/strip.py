@@ -46,8 +46,7 @@ class GroundStrip:
 
 def lay_together(views: Sequence[GroundView], largest_m: float, gsd_m: float) -> GroundStrip | None:
     """A strip of the views, newest first, up to the first one that does not show its neighbour's
-    ground, or for which it would be larger than `largest_m`; None if that leaves one, or
-    a few pixels.
+    ground, or for which it would be larger than `largest_m`; None if that leaves a few pixels.
     """
     height = views[0].height_m
     grounds = [footprint(v.camera, v.rotation, v.height_m, largest_m) for v in views]
@@ -67,7 +66,7 @@ def lay_together(views: Sequence[GroundView], largest_m: float, gsd_m: float) ->
         places.append(places[-1] + way)
         centre, side = middle, whole
     n = round(side / gsd_m)
-    if len(places) == 1 or n < _LEAST_PX:
+    if n < _LEAST_PX:
         return None
     image = np.zeros((n, n, 4), np.uint8)
     for view, place in zip(views, places, strict=False):

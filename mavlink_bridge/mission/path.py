@@ -13,15 +13,11 @@ from dataclasses import dataclass, field
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.errors import MissionError
-from mavlink_bridge.mission.gimbal import (
-    GIMBAL_COMMANDS,
-    GimbalTarget,
-    gimbal_after,
-)
 from mavlink_bridge.mission.items import (
     DESCENTS,
     FLY_TOO,
     FRAMES,
+    GIMBAL_COMMANDS,
     GIMBAL_ONLY,
     LANDINGS,
     NO_EFFECT,
@@ -30,6 +26,7 @@ from mavlink_bridge.mission.items import (
     TAKEOFFS,
     UNKNOWN_VEHICLE,
     VIEW,
+    GimbalTarget,
     HeightAbove,
     LoiterCircle,
     MissionItem,
@@ -37,6 +34,7 @@ from mavlink_bridge.mission.items import (
     UnreadItem,
     circle_of,
     command_name,
+    gimbal_after,
 )
 
 _MOST_STEPS = 200_000  # of a mission of jumps in jumps

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from localizer.geometry.camera import Camera
 from localizer.types import Image
-from sitl.ground.connection import disable_reconnect
+from sitl.ground.link import disable_reconnect
 from sitl.ground.vehicle_record import VEHICLE
 
 MOST = 2.0  # focal length at level 100 over that at level 0

@@ -28,7 +28,7 @@ from sitl.camera.movers import Mover, round_trip
 from sitl.camera.world_camera import FRAME_COLUMNS
 from sitl.demo.assets import FlightAssets
 from sitl.errors import SimulationError
-from sitl.ground.connection import Connection
+from sitl.ground.link import Connection
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.process import VehicleProcess
 

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.geometry.antimeridian import GeoBox, lon_near, wrapped
-from localizer.geometry.geo import LocalFrame
+from localizer.geometry.geo import GeoBox, LocalFrame, lon_near, wrapped
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer

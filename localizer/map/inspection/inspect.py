@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from localizer.errors import MapCacheError, OutsideMapError
-from localizer.geometry.antimeridian import Corner, split_outline
 from localizer.geometry.camera import Camera
-from localizer.geometry.geo import Geodetic, level_camera
+from localizer.geometry.geo import Corner, Geodetic, level_camera, split_outline
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import Manifest, TileCache
 from localizer.map.cache.stream import TileStreamer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import degrees, isnan, radians
 from typing import Any
 
@@ -10,20 +11,31 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.control.mode import Mode
 from sitl.embedded.ekf.injection import Clock
-from sitl.embedded.mavlink.handling import (
-    ACCEPTED,
-    DENIED,
-    FAILED,
-    UNSUPPORTED,
-    CommandHandler,
-    Handler,
-    location_of,
-)
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import TelemetryBuilder
 from sitl.embedded.physics.gimbal import FLAG_NEUTRAL, FLAG_YAW_LOCK
 from sitl.embedded.severity import INFO, WARNING
 from sitl.geodesy import Location
+
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4  # MAV_RESULT
+_GLOBAL_FRAMES_RELATIVE = (3, 6)
+_GLOBAL_FRAMES = (0, 5, *_GLOBAL_FRAMES_RELATIVE)
+
+Handler = Callable[[SerialPort, Any], None]
+CommandHandler = Callable[[SerialPort, Any], int]
+
+
+def location_of(
+    home: Location | None, frame: int, x: int, y: int, altitude: float
+) -> Location | None:
+    """Location of a message's coordinates (degrees * 1e7, m) in a global MAV_FRAME. None for other
+    frames, or without home.
+    """
+    if frame not in _GLOBAL_FRAMES or home is None:
+        return None
+    base = home.altitude_m if frame in _GLOBAL_FRAMES_RELATIVE else 0.0
+    return Location(x / 1e7, y / 1e7, base + altitude)
+
 
 _IGNORE_POSITION, _IGNORE_YAW = 7, 1 << 10
 _SET_GLOBAL_ORIGIN = 611  # MAV_CMD_DO_SET_GLOBAL_ORIGIN, newer than pymavlink's dialect

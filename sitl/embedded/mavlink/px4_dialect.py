@@ -12,8 +12,7 @@ from sitl.embedded.control.mode import Mode
 from sitl.embedded.control.px4_modes import NUMBERS, custom_mode
 from sitl.embedded.ekf.ekf2_injection import Px4PositionInput, RemoteClock
 from sitl.embedded.ekf.injection import Clock
-from sitl.embedded.mavlink.commands import Commands
-from sitl.embedded.mavlink.handling import ACCEPTED, FAILED
+from sitl.embedded.mavlink.commands import ACCEPTED, FAILED, Commands
 from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import TelemetryBuilder
 

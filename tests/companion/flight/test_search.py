@@ -12,7 +12,7 @@ from companion.inertial import InertialTrack
 from localizer.config import LocalizerConfig
 from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.types import Relocalization, SearchRegion
 from localizer.types import Frame, TrackingState
@@ -104,7 +104,7 @@ class Falling:
 
 
 class Slow:
-    """A relocalizer that is right; `wide_s` for the map and 0.4 s for a small part of it."""
+    """A relocalizer that is right; `wide_s` for the map and 0.3 s for a small part of it."""
 
     def __init__(self, autopilot):
         self.autopilot, self.queries, self.blind, self.wide_s = autopilot, [], False, 4.0
@@ -119,8 +119,8 @@ class Slow:
     def find(self, query, _should_stop):
         place = self.autopilot.place
         self.queries.append(query)
-        wide = query.region is None or query.region.shape[0, 0] > 50.0**2
-        self.autopilot.time_s += self.wide_s if wide else 0.4
+        wide = query.region is None or query.region.shape[0, 0] > 90.0**2
+        self.autopilot.time_s += self.wide_s if wide else 0.3
         if self.blind or not (query.region is None or query.region.contains(place[:2])):
             return None
         pose = Pose(np.eye(3), place)
@@ -214,7 +214,7 @@ def test_a_place_that_three_frames_do_not_show_again_is_forgotten(slowly):
     slow.blind = False
     assert search.search(falling.frame(), lambda: False) is None  # the wide search anew
     near = [float(np.sqrt(q.region.shape[0, 0])) for q in slow.queries[1:-1]]
-    assert near == pytest.approx([42.0, 45.2, 48.4])
+    assert near == pytest.approx([70.0, 74.5, 79.0])
     assert slow.queries[-1].region is None  # the fifth search
 
 
@@ -271,8 +271,18 @@ def test_the_place_that_a_search_of_a_large_map_finds_is_followed_to_now(slowly)
     assert np.linalg.norm(prior.world_from_camera.translation - falling.place) < 2.0
     assert prior.velocity == pytest.approx([3.0, 0.0, -2.0], abs=0.01)
     followed, again = slow.queries[1:]
-    assert float(np.sqrt(followed.region.shape[0, 0])) == pytest.approx(370.0)
+    assert float(np.sqrt(followed.region.shape[0, 0])) == pytest.approx(685.0)
     assert followed.heading_sigma_rad > again.heading_sigma_rad
+
+
+def test_the_attitude_of_the_next_search_is_right_whatever_the_unknown_heading(slowly):
+    (search, slow, falling), unknown = slowly(), np.eye(3)[[1, 0, 2]] * [[-1.0], [1.0], [1.0]]
+    falling.attitude = unknown  # by 90 degrees
+    assert search.search(falling.frame(), lambda: False) is None
+    rolled = so3_exp(np.array([0.3, 0.1, 0.2]))  # in the map's axes
+    falling.attitude = unknown @ rolled
+    search.search(falling.frame(), lambda: False)
+    assert slow.queries[1].rotation == pytest.approx(rolled)
 
 
 @pytest.mark.parametrize(
@@ -299,13 +309,13 @@ def test_after_a_long_search_it_is_looked_for_where_it_circled_and_straight_on(s
 
 @pytest.mark.parametrize(
     ("jump_m", "centre", "radius_m"),
-    [(0.0, 12.0, 14.0), (60.0, 0.0, 42.0), (None, 12.0, 18.0)],
+    [(0.0, 12.0, 14.0), (60.0, 0.0, 70.0), (None, 12.0, 18.0)],
     ids=["whole record of the IMU", "broken one", "velocity of the EKF"],
 )
 def test_the_next_search_is_as_near_as_the_motion_is_known(slowly, jump_m, centre, radius_m):
     def reach(time_ns):
         t = time_ns * 1e-9
-        return SearchRegion.circle(np.array([3.0 * t + jump_m * (t > 1.0), 0.0]), 80.0 + t)
+        return SearchRegion.circle(np.array([3.0 * t + jump_m * (t > 1.0), 0.0]), 100.0 + t)
 
     search, slow, falling = slowly(
         *((None, np.array([3.0, 0.0, -2.0])) if jump_m is None else (reach,))

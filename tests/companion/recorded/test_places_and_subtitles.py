@@ -5,7 +5,7 @@ import pytest
 
 from companion.errors import FootageError
 from companion.recorded.flight import Datum, Track
-from companion.recorded.places_file import read_places
+from companion.recorded.photo_tags import read_places
 from companion.recorded.video import read_subtitles
 
 

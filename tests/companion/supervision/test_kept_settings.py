@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
-from companion.supervision.processes import FlightProcess
-from companion.supervision.restart import keep_settings, settings_of
+from companion.supervision.processes import FlightProcess, keep_settings, settings_of
 
 MODEL = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
 SHIPPED = Path(__file__).parents[3] / "configs" / "deployment.yaml"

@@ -20,8 +20,16 @@ import pytest
 
 from companion.config import CompanionConfig, parse_config
 from companion.flight.channels import Feed
-from companion.supervision.processes import ENDING, Beat, FlightProcess, Pulse, ServiceManager, line
-from companion.supervision.restart import without_lost_disks, write_problem
+from companion.supervision.processes import (
+    ENDING,
+    Beat,
+    FlightProcess,
+    Pulse,
+    ServiceManager,
+    line,
+    without_lost_disks,
+    write_problem,
+)
 from companion.supervision.supervisor import RestartPolicy, Supervisor, exit_code_text, mark_dead
 from mavlink_bridge.alerts.alert import Alert
 from mavlink_bridge.alerts.catalogue import alert, body
@@ -624,7 +632,7 @@ def test_a_log_that_is_there_is_appended_to(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_stands_still_is_not_even_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("companion.supervision.restart._PATIENCE_S", 0.05)
+    monkeypatch.setattr("companion.supervision.processes._PATIENCE_S", 0.05)
     still = threading.Event()
 
     def probe(folder: Path) -> str:

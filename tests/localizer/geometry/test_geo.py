@@ -10,8 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from localizer.errors import GeoreferenceError
-from localizer.geometry.antimeridian import GeoBox, geo_box, lon_near, split_outline, wrapped
-from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame, ecef_from_geodetic
+from localizer.geometry.geo import (
+    NED_FROM_ENU,
+    GeoBox,
+    Geodetic,
+    LocalFrame,
+    ecef_from_geodetic,
+    geo_box,
+    lon_near,
+    split_outline,
+    wrapped,
+)
 from localizer.geometry.geoid import geoid_separation
 from localizer.map.inspection.alignment import usable_part
 from localizer.map.inspection.inspect import as_geojson, as_kml

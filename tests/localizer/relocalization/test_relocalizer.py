@@ -23,7 +23,7 @@ from localizer.relocalization import verdict
 from localizer.relocalization.correlate import ORIGIN_CELLS, ROUGH_CELLS, LevelCorrelator
 from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.overview import open_overview, overview_key
-from localizer.relocalization.patch import footprint, with_heading
+from localizer.relocalization.patch import footprint, rectify, with_heading
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.relocalization.strip import lay_together
 from localizer.relocalization.types import (
@@ -280,7 +280,7 @@ def test_a_covered_lens_is_not_searched_for(opened, query):
 
 
 def test_stops_when_told(opened, query, monkeypatch):
-    calls, looked, rectify = [], [], searching.rectify
+    calls, looked = [], []
     monkeypatch.setattr(searching, "rectify", lambda *a: looked.append(a) or rectify(*a))
 
     def stop():

@@ -29,7 +29,7 @@ PARSES = {  # methods of a text, and of `re`
 OUTSIDE = {  # why a value is a `Name` and none of a closed list
     "mavlink_bridge/bridge.py": "the system's error",
     "mavlink_bridge/components.py": "an address",
-    "mavlink_bridge/vehicle/unexpected_senders.py": "an address",
+    "mavlink_bridge/vehicle_events.py": "an address",
     "mavlink_bridge/injection/fix_sender.py": "a MAVLink message of the configuration",
     "companion/flight/component_table.py": "an address",
     "companion/integrity_monitor/integrity_monitor.py": "a thread",

@@ -8,12 +8,13 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.errors import MissionError
-from mavlink_bridge.mission.gimbal import GimbalTarget, RegionOfInterest
 from mavlink_bridge.mission.items import (
+    GimbalTarget,
     HeightAbove,
     LoiterCircle,
     MissionItem,
     MissionVehicle,
+    RegionOfInterest,
     UnreadItem,
 )
 from mavlink_bridge.mission.path import PlannedMission, planned_path

@@ -23,7 +23,7 @@ from mavlink_bridge.status import StatusNotifier
 from mavlink_bridge.vehicle.origin import north_east
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
 from mavlink_bridge.vehicle.tracker import VehicleTracker
-from mavlink_bridge.vehicle.unexpected_senders import UnexpectedSenderMonitor
+from mavlink_bridge.vehicle_events import UnexpectedSenderMonitor
 from tests.mavlink_bridge.simulated import MS, SECOND, exchanging
 
 
