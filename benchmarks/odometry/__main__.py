@@ -56,7 +56,7 @@ class _Terrain:
     offset_m: float
 
     def height(self, east: ArrayLike, north: ArrayLike) -> Array:
-        """See `localizer.odometry.TerrainModel`."""
+        """See `localizer.odometry.ground.TerrainModel`."""
         return np.asarray(self.info.ground_height(east, north)) + self.offset_m
 
 

@@ -115,7 +115,7 @@ class TargetFilter:
     @property
     def moves(self) -> bool:
         """Whether the target more probably moves than stands."""
-        return bool(self._hypotheses) and self._hypotheses[0].models.mu[_STANDING] < 0.5
+        return bool(self._hypotheses and self._hypotheses[0].models.mu[_STANDING] < 0.5)
 
     @property
     def position(self) -> Array:
